@@ -122,8 +122,9 @@ def _materialise(values):
     """The same tree of arrays, computed once.
 
     XLA:CPU fuses a producer into each of its consumers and runs it again for each output and each row of a stacked one,
-    which made the contacts below and their derivatives 20 to 500 times slower. It does not fuse across a loop, and unrolls one of a single
-    trip; an `optimization_barrier` it drops. So: two trips of an identity that it cannot prove to be one.
+    which made the contacts below and their derivatives 20 to 500 times slower. It does not fuse across a loop, and
+    unrolls one of a single trip; an `optimization_barrier` it drops. So: two trips of an identity that it cannot prove
+    to be one.
     """
 
     def same(_, current):

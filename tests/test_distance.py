@@ -271,7 +271,7 @@ def test_moving_out_along_the_normal_frees_the_pair(kind_a, kind_b):
 
 
 def moved(motion, body, stretches):
-    """A body's arguments after motion (9, n): shift, turn, growth. `stretches` is 1 if a segment grows longer, else 0."""
+    """A body's arguments after motion (9, n): shift, turn, growth. `stretches` is 1 if a segment may grow, else 0."""
     shift, (x, y, z), growth = motion[:3], motion[3:6], motion[6:]
     zero = jnp.zeros_like(x)
     skew = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
