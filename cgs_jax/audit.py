@@ -26,8 +26,8 @@ from cgs_jax.errors import InputError
 
 Floats = NDArray[np.floating[Any]]
 
-_CHUNK = 1024
-"""Configurations per pass: few enough that the rows of a pass stay in the processor's cache."""
+_CHUNK = 2048
+"""Configurations per pass: enough to spread the cost of calling numpy, few enough to stay in the processor's cache."""
 
 _PROJECTIONS = 4
 """Rounds of projecting to and fro before a pair with a box is left to C MuJoCo."""
@@ -92,7 +92,7 @@ class Auditor:
         self._kinematics = _Kinematics(model)
         self._contacts = _Contacts(model, self._kinematics)
         self._joints = _Joints(model)
-        self._initial = _Configuration(self._kinematics, np.array(model.qpos0)[:, None])
+        self._initial = _Configuration(self._kinematics.frames(np.array(model.qpos0)[:, None]))
         self._conditions: list[_Condition] = []
         self._poses: set[str] = set()
         for entry in attachments:
@@ -131,22 +131,26 @@ class Auditor:
             finite &= np.isfinite(stored[name]).all(axis=1)
         violation = np.full((len(qpos), len(self.constraints)), np.inf)
         rows = np.flatnonzero(finite)
-        scratch = self._contacts.scratch(min(_CHUNK, rows.size))
-        for start in range(0, rows.size, _CHUNK):
-            chunk = rows[start : start + _CHUNK]
+        per_pass = max(1, min(rows.size, _CHUNK // switches))
+        scratch = self._contacts.scratch(per_pass * switches)
+        for start in range(0, rows.size, per_pass):
+            chunk = rows[start : start + per_pass]
             part = {name: value[chunk] for name, value in stored.items()}
             violation[chunk] = self._check_chunk(qpos[chunk], part, scratch)
         return AuditResult((violation <= self.tolerance).all(axis=1), violation, self.constraints, self.tolerance)
 
     def _check_chunk(self, qpos: Floats, stored: Mapping[str, Floats], scratch: _Scratch) -> Floats:
+        count, switches, nq = qpos.shape
+        lanes = np.ascontiguousarray(qpos.T).reshape(nq, switches * count)
+        links = self._kinematics.frames(lanes)
+        penetration = self._contacts.penetration(lanes, links, scratch).reshape(switches, count)
         configurations: dict[str | None, _Configuration] = {None: self._initial}
-        penetration = []
         for k, switch in enumerate(self.mode_switches):
-            configuration = _Configuration(self._kinematics, np.ascontiguousarray(qpos[:, k].T))
-            configurations[switch] = configuration
-            penetration.append(self._contacts.penetration(configuration, scratch))
+            at_switch = slice(k * count, (k + 1) * count)
+            parts = [(rotation[..., at_switch], position[..., at_switch]) for rotation, position in links]
+            configurations[switch] = _Configuration(parts)
         columns = [error for condition in self._conditions for error in condition.errors(configurations, stored)]
-        columns += penetration
+        columns += list(penetration)
         beyond, deviation = self._joints.errors(qpos)
         for name in self._poses & stored.keys():
             deviation = np.maximum(deviation, np.abs(np.linalg.norm(stored[name][:, 3:], axis=1) - 1.0))
@@ -443,18 +447,17 @@ def _frame_with_z(axis: Floats) -> Floats:
 
 
 class _Configuration:
-    """Poses at B configurations of one mode switch, computed once however many conditions ask."""
+    """Poses of frames at B configurations, computed once however many conditions ask for them."""
 
-    def __init__(self, kinematics: _Kinematics, qpos: Floats) -> None:
-        self.qpos = qpos
-        self.links = kinematics.frames(qpos)
+    def __init__(self, links: list[_Pose]) -> None:
+        self._links = links
         self._poses: dict[int, _Pose] = {}
 
     def pose(self, frame: _Fixed) -> _Pose:
         """T_world_frame: (3, 3, B) and (3, B)."""
         key = id(frame)
         if key not in self._poses:
-            rotation, position = self.links[frame.link]
+            rotation, position = self._links[frame.link]
             rows = np.matmul(np.concatenate([frame.rotation.T, frame.position[None]]), rotation)
             self._poses[key] = rows[:, :3], position + rows[:, 3]
         return self._poses[key]
@@ -636,26 +639,25 @@ class _Contacts:
                 centre[:, of_geoms], edge[:, of_edges] = vectors[:count].T[..., None], vectors[count:].T[..., None]
         return _Scratch(centre, edge, mujoco.MjData(self.model))
 
-    def penetration(self, at: _Configuration, scratch: _Scratch) -> Floats:
-        """Deepest penetration (B,) in m, zero where nothing touches."""
-        depth = np.zeros(at.qpos.shape[1])
-        open_ = self.unproved(at, scratch)
+    def penetration(self, qpos: Floats, links: list[_Pose], scratch: _Scratch) -> Floats:
+        """Deepest penetration (B,) in m at qpos (nq, B), zero where nothing touches."""
+        depth = np.zeros(qpos.shape[1])
         model, data = self.model, scratch.data
-        for index in np.flatnonzero(open_):
-            data.qpos[:] = at.qpos[:, index]
+        for index in np.flatnonzero(self.unproved(links, scratch)):
+            data.qpos[:] = qpos[:, index]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
             if data.ncon:
                 depth[index] = max(0.0, -data.contact.dist.min())
         return depth
 
-    def unproved(self, at: _Configuration, scratch: _Scratch) -> NDArray[np.bool_]:
+    def unproved(self, links: list[_Pose], scratch: _Scratch) -> NDArray[np.bool_]:
         """True (B,) where no proof was found that the configuration is free of contact."""
-        batch = at.qpos.shape[1]
+        batch = links[0][1].shape[1]
         open_ = np.full(batch, self.never_proved)
         if self.never_proved:
             return open_
-        self._fill(at, scratch, batch)
+        self._fill(links, scratch, batch)
         first, second, lane = self._near(scratch.centre[:, :, :batch])
         boxes = self.box[first].astype(np.int8) + self.box[second]
         for count in range(3):
@@ -672,11 +674,11 @@ class _Contacts:
             open_[at_lane[~apart]] = True
         return open_
 
-    def _fill(self, at: _Configuration, scratch: _Scratch, batch: int) -> None:
+    def _fill(self, links: list[_Pose], scratch: _Scratch, batch: int) -> None:
         for link, of_geoms, of_edges, vectors in self.groups:
             if link == 0:
                 continue
-            rotation, position = at.links[link]
+            rotation, position = links[link]
             rows = np.matmul(vectors, rotation)
             count = of_geoms.stop - of_geoms.start
             np.add(rows[:, :count], position[:, None], out=scratch.centre[:, of_geoms, :batch], casting="same_kind")
@@ -748,6 +750,8 @@ class _Contacts:
             for edge, squared in zip(box, box_squared, strict=True):
                 nearest += np.clip(_dot(point, edge) / squared, -1.0, 1.0) * edge
             proved |= _separates(point - nearest, away, (*ours, *box), reach)
+            if proved.all():
+                break
             back = nearest - away
             point = away.copy()
             for edge, squared in zip(ours, ours_squared, strict=True):

@@ -64,7 +64,7 @@ def test_poses_agree_with_c_mujoco_for_every_joint_type():
     kinematics = audit._Kinematics(model)
     rng = np.random.default_rng(0)
     qpos = rng.normal(size=(40, model.nq))  # quaternions of any length: MuJoCo normalises them too
-    at = audit._Configuration(kinematics, qpos.T.copy())
+    at = audit._Configuration(kinematics.frames(qpos.T.copy()))
     for row, q in enumerate(qpos):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
@@ -149,8 +149,8 @@ def test_most_free_configurations_are_proved_free():
         qpos[:, address : address + 3] = rng.uniform(-2, 2, (800, 3))
     checker = Auditor(model, [], [], [], ["now"])
     free = checker.check(qpos[:, None]).violation[:, 0] == 0
-    at = audit._Configuration(checker._kinematics, qpos.T.copy())
-    open_ = checker._contacts.unproved(at, checker._contacts.scratch(800))
+    links = checker._kinematics.frames(qpos.T.copy())
+    open_ = checker._contacts.unproved(links, checker._contacts.scratch(800))
     assert free.sum() > 100
     assert open_[free].mean() < 0.1
 
