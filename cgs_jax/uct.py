@@ -164,12 +164,7 @@ class _Node:
 
 
 class _Records:
-    """Statistics of a run whatever the rule of choice, and the predictions that follow from them.
-
-    retain: on failure the components which the failed transition does not touch are kept and combined again; without
-    it the whole partial sample is dropped. discount: factor on old evidence per visit. initial_cost: guessed seconds
-    per condition of an operator that never ran.
-    """
+    """Statistics of a run whatever the rule of choice, and the predictions that follow from them (see Tree)."""
 
     kind = ""
 
@@ -443,7 +438,9 @@ class Tree(_Records):
     c_uct: weight of the exploration bonus, on values normalised to [0, 1] among siblings. reward: "rate" (time costs
     the discounted realised rate) or "rollout" (time costs one over the mean seconds per rollout).
     equivalent_visits: an operator's visits elsewhere count on an edge like up to so many visits of its own, so that
-    not every child of every node is tried anew. Other arguments: see Fixed.
+    not every child of every node is tried anew. retain: on failure the components which the failed transition does not
+    touch are kept and combined again; without it the whole partial sample is dropped. discount: factor on old evidence
+    per visit. initial_cost: guessed seconds per condition of an operator that never ran.
 
     Every kept transition is tried again and again: its bonus grows with the logarithm of its siblings' visits, while
     what its operator does elsewhere counts at most `equivalent_visits`.
@@ -784,7 +781,7 @@ class Tree(_Records):
 
 
 class Fixed(_Records):
-    """Always the same sequence (the paper's experts). Arguments as those of Tree."""
+    """Always the same sequence (the paper's experts). settings: retain, discount, initial_cost as for Tree."""
 
     kind = "fixed"
 
