@@ -67,7 +67,7 @@ class AuditResult:
 
 
 class Auditor:
-    """Checks samples of one scene; it holds no state between calls, so threads may share it.
+    """Checks samples of one scene. Threads may share it: what a call writes to is its own.
 
     model: the compiled scene. Contact margins in it are ignored: only penetration counts.
     attachments, placements, goals: the lists of the schema `cgs_jax/1`. An attachment or a placement may also name its
@@ -132,11 +132,12 @@ class Auditor:
         violation = np.full((len(qpos), len(self.constraints)), np.inf)
         rows = np.flatnonzero(finite)
         per_pass = max(1, min(rows.size, _CHUNK // switches))
-        scratch = self._contacts.scratch(per_pass * switches)
+        scratch = self._contacts.borrow(per_pass * switches)
         for start in range(0, rows.size, per_pass):
             chunk = rows[start : start + per_pass]
             part = {name: value[chunk] for name, value in stored.items()}
             violation[chunk] = self._check_chunk(qpos[chunk], part, scratch)
+        self._contacts.give_back(scratch)
         return AuditResult((violation <= self.tolerance).all(axis=1), violation, self.constraints, self.tolerance)
 
     def _check_chunk(self, qpos: Floats, stored: Mapping[str, Floats], scratch: _Scratch) -> Floats:
@@ -545,7 +546,7 @@ def live_pairs(model: mujoco.MjModel) -> NDArray[np.intp]:
 
 @dataclass
 class _Scratch:
-    """Memory of one `check` call: float32 geom centres and half edges (3, rows, B), and MuJoCo's own data."""
+    """Memory that one `check` call uses: float32 geom centres and half edges (3, rows, B), and MuJoCo's own data."""
 
     centre: Floats
     edge: Floats
@@ -570,6 +571,7 @@ class _FixedBox:
     rotation: Floats
     position: Floats
     half: Floats
+    aligned: bool
     others: slice | NDArray[np.intp]
     indices: NDArray[np.intp]
     reach_squared: Floats
@@ -604,6 +606,7 @@ class _Contacts:
         pairs = np.sort(row_of[live_pairs(model)], axis=1)
         provable = np.array([core.provable for core in self.cores], dtype=bool)
         self.never_proved = bool(model.nflex) or not provable[pairs].all()
+        self._spare: list[_Scratch] = []
         self.fixed_boxes: list[_FixedBox] = []
         self.partners: list[_Partners] = []
         for row in np.unique(pairs[:, 0]).tolist():
@@ -612,8 +615,10 @@ class _Contacts:
             if core.link == 0 and core.is_box:
                 reach = _squared_reach(self.bound[indices])
                 rotation, half = core.box_axes()
-                others = _as_slice(indices)
-                self.fixed_boxes.append(_FixedBox(row, rotation, core.centre, half, others, indices, reach))
+                aligned = np.array_equal(rotation, np.eye(3))
+                position = core.centre.astype(np.float32)
+                box = _FixedBox(row, rotation, position, half, aligned, _as_slice(indices), indices, reach)
+                self.fixed_boxes.append(box)
             else:
                 reach = _squared_reach(self.bound[indices] + core.bound)
                 self.partners.append(_Partners(row, _as_slice(indices), indices, reach))
@@ -629,6 +634,17 @@ class _Contacts:
             edges = slice(int(self.first_edge[first]), int(self.first_edge[last + 1]))
             groups.append((link, slice(first, last + 1), edges, np.array(vectors)))
         return groups
+
+    def borrow(self, batch: int) -> _Scratch:
+        """Memory for so many configurations that no other thread uses; new memory costs more than filling it."""
+        try:
+            scratch = self._spare.pop()
+        except IndexError:
+            return self.scratch(batch)
+        return scratch if scratch.centre.shape[2] >= batch else self.scratch(batch)
+
+    def give_back(self, scratch: _Scratch) -> None:
+        self._spare.append(scratch)
 
     def scratch(self, batch: int) -> _Scratch:
         centre = np.zeros((3, len(self.cores), batch), dtype=np.float32)
@@ -695,9 +711,9 @@ class _Contacts:
             lanes.append(lane)
 
         for box in self.fixed_boxes:
-            away = centre[:, box.others]
-            outside = np.matmul(box.rotation.T, away.reshape(3, -1)).reshape(away.shape)
-            outside -= (box.rotation.T @ box.position)[:, None, None]
+            outside = centre[:, box.others] - box.position[:, None, None]
+            if not box.aligned:
+                outside = np.matmul(box.rotation.T, outside.reshape(3, -1)).reshape(outside.shape)
             np.abs(outside, out=outside)
             outside -= box.half[:, None, None]
             np.maximum(outside, 0.0, out=outside)
@@ -733,16 +749,20 @@ class _Contacts:
         ours = [_gather(scratch.edge, self.first_edge[a] + j, lane) for j in range(edges)]
         box = [_gather(scratch.edge, self.first_edge[b] + j, lane) for j in range(3)]
         reach = self.reach[a] + self.reach[b]
+        box_squared = [np.maximum(_dot(edge, edge), _TINY) for edge in box]
         apart = np.zeros(len(a), dtype=bool)
-        for normal in box:
-            apart |= _separates(normal, away, (*ours, *box), reach)
+        for normal, squared in zip(box, box_squared, strict=True):
+            gap = np.abs(_dot(normal, away)) - squared
+            for edge in ours:
+                gap -= np.abs(_dot(normal, edge))
+            apart |= (gap > 0.0) & (gap * gap > reach * reach * squared)
         left = np.flatnonzero(~apart)
         if not left.size:
             return apart
         away, reach = away[:, left], reach[left]
         ours, box = [edge[:, left] for edge in ours], [edge[:, left] for edge in box]
         ours_squared = [np.maximum(_dot(edge, edge), _TINY) for edge in ours]
-        box_squared = [np.maximum(_dot(edge, edge), _TINY) for edge in box]
+        box_squared = [squared[left] for squared in box_squared]
         point = away
         proved = np.zeros(left.size, dtype=bool)
         for _ in range(_PROJECTIONS):

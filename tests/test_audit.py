@@ -279,6 +279,8 @@ def test_threads_may_share_one_auditor():
         thread.join()
     for outcome in outcomes:
         np.testing.assert_array_equal(outcome.violation, expected.violation)
+    few = checker.check(qpos[1500:1507], {"t": t[1500:1507]})
+    np.testing.assert_allclose(few.violation, expected.violation[1500:1507], atol=1e-12)
 
 
 def test_no_samples_and_wrong_input():
