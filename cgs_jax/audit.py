@@ -26,8 +26,8 @@ from cgs_jax.errors import InputError
 
 Floats = NDArray[np.floating[Any]]
 
-_CHUNK = 2048
-"""Configurations per pass: enough to spread the cost of calling numpy, few enough to stay in the processor's cache."""
+_CHUNK = 8192
+"""Configurations per pass, 30 MB of memory for two arms: a pass costs 2 ms of calling numpy, however short its rows."""
 
 _PROJECTIONS = 4
 """Rounds of projecting to and fro before a pair with a box is left to C MuJoCo."""
@@ -131,9 +131,10 @@ class Auditor:
             finite &= np.isfinite(stored[name]).all(axis=1)
         violation = np.full((len(qpos), len(self.constraints)), np.inf)
         rows = np.flatnonzero(finite)
-        per_pass = max(1, min(rows.size, _CHUNK // switches))
+        passes = -(-rows.size * switches // _CHUNK)
+        per_pass = -(-rows.size // max(passes, 1))
         scratch = self._contacts.borrow(per_pass * switches)
-        for start in range(0, rows.size, per_pass):
+        for start in range(0, rows.size, max(per_pass, 1)):
             chunk = rows[start : start + per_pass]
             part = {name: value[chunk] for name, value in stored.items()}
             violation[chunk] = self._check_chunk(qpos[chunk], part, scratch)
