@@ -29,6 +29,9 @@ Floats = NDArray[np.floating[Any]]
 _CHUNK = 8192
 """Configurations per pass, 30 MB of memory for two arms: a pass costs 2 ms of calling numpy, however short its rows."""
 
+_WORTH_PROVING = 200
+"""Configurations from which on the proofs, whose calls to numpy cost over a millisecond, save time."""
+
 _PROJECTIONS = 4
 """Rounds of projecting to and fro before a pair with a box is left to C MuJoCo."""
 
@@ -660,7 +663,8 @@ class _Contacts:
         """Deepest penetration (B,) in m at qpos (nq, B), zero where nothing touches."""
         depth = np.zeros(qpos.shape[1])
         model, data = self.model, scratch.data
-        for index in np.flatnonzero(self.unproved(links, scratch)):
+        worth_proving = qpos.shape[1] >= _WORTH_PROVING
+        for index in np.flatnonzero(self.unproved(links, scratch)) if worth_proving else range(qpos.shape[1]):
             data.qpos[:] = qpos[:, index]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
