@@ -1,0 +1,319 @@
+"""Projection of seeds onto a set of constraints: a batched augmented Lagrangian with damped Gauss-Newton steps.
+
+Every constraint row asks for `low <= c(x) <= high`; an equality has `low == high`, an inequality `c <= 0` has
+`low = -inf, high = 0`. With multipliers `y` and penalty `rho` the augmented Lagrangian of the feasibility problem is
+`rho / 2 * |d(c + y / rho)|^2`, where `d(s) = s - clip(s, low, high)` is the distance vector to the interval. Its Gauss-Newton
+model gives the step `-J^T (J J^T + mu I)^-1 d`: as many equations as rows, since a conditional problem of a pruned graph never
+has more equality rows than unknowns. Without a cost all multipliers vanish at a feasible point and the quadratic penalty is
+exact, so that the default never updates them (`multiplier_period = 0`); see `docs/performance.md` for what was measured.
+
+A solver is three functions, `init`, `step` and `finished`; `project` and `project_queue` are the loops over them. Arrays
+have their lanes (independent problems) last.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+PyTree = Any
+
+
+class Rows(NamedTuple):
+    """m constraint rows at one point: `low <= value <= high`, with n unknowns."""
+
+    value: jax.Array  # (m, lanes)
+    low: jax.Array  # (m, 1 or lanes)
+    high: jax.Array  # (m, 1 or lanes)
+    aim_low: jax.Array  # (m, 1 or lanes) a violated row is pulled to this point inside the interval, not onto its end
+    aim_high: jax.Array  # (m, 1 or lanes)
+    jacobian: jax.Array  # (m, n, lanes)
+
+
+class System(Protocol):
+    """What the solver must know of a problem; all methods are pure and batched over lanes."""
+
+    def rows(self, x: PyTree, data: PyTree) -> Rows:
+        """Linearises all constraints at x."""
+        ...
+
+    def room(self, x: PyTree, data: PyTree) -> tuple[jax.Array, jax.Array]:
+        """Smallest and largest admissible step of each unknown, both `(n, lanes)`; infinite where unbounded."""
+        ...
+
+    def retract(self, x: PyTree, step: jax.Array) -> PyTree:
+        """Moves x by a tangent step `(n, lanes)`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a projection runs."""
+
+    tolerance: float = 2.5e-5
+    """Largest violation of any row, in its own unit (m or rad), that counts as feasible."""
+    max_iterations: int = 24
+    """Iterations after which a lane is given up."""
+    damping: float = 0.07
+    """Levenberg-Marquardt damping mu = damping * |d|^2 + 1e-6."""
+    max_step: float = 0.6
+    """Largest change of one unknown in one iteration, rad or m."""
+    stall_after: int = 6
+    """From this iteration on, a lane whose squared residual fell by less than `stall_ratio` over a check period is given up."""
+    stall_ratio: float = 0.5
+    """See `stall_after`."""
+    check_period: int = 2
+    """Iterations between two looks at which lanes have finished."""
+    multiplier_period: int = 0
+    """Iterations between two updates of the multipliers; 0 leaves them at zero (no cost, so the penalty is exact)."""
+    penalty: float = 1.0
+    """Initial penalty rho."""
+    penalty_growth: float = 4.0
+    """Factor on rho after a multiplier update that did not halve the violation."""
+
+
+class State(NamedTuple):
+    """One projection in flight."""
+
+    x: PyTree
+    pressed: jax.Array  # (n, lanes) bool: the last step was cut at a bound, so the next one leaves this unknown alone
+    multipliers: jax.Array  # (m, lanes)
+    penalty: jax.Array  # (lanes,)
+    iteration: jax.Array  # (lanes,) steps made
+    violation: jax.Array  # (lanes,) largest row violation at x as it was when last looked at
+    residual: jax.Array  # (lanes,) squared residual there
+    checked: jax.Array  # (lanes,) squared residual at the last stall check
+    updated: jax.Array  # (lanes,) violation at the last multiplier update
+
+
+def distance_to_interval(value: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Signed distance vector `value - clip(value, low, high)`."""
+    return value - jnp.clip(value, low, high)
+
+
+def init(system: System, x: PyTree, data: PyTree, settings: Settings) -> State:
+    """State before the first step; x has its lanes last."""
+    shape = jax.eval_shape(system.rows, x, data)
+    rows, unknowns, lanes = shape.jacobian.shape
+    dtype = shape.value.dtype
+    big = jnp.full((lanes,), jnp.inf, dtype)
+    return State(
+        x=x,
+        pressed=jnp.zeros((unknowns, lanes), bool),
+        multipliers=jnp.zeros((rows, lanes), dtype),
+        penalty=jnp.full((lanes,), settings.penalty, dtype),
+        iteration=jnp.zeros((lanes,), jnp.int32),
+        violation=big,
+        residual=big,
+        checked=big,
+        updated=big,
+    )
+
+
+def step(system: System, state: State, data: PyTree, settings: Settings) -> State:
+    """One damped Gauss-Newton iteration; a lane that is already feasible or has finished does not move."""
+    rows = system.rows(state.x, data)
+    violation = jnp.max(jnp.abs(distance_to_interval(rows.value, rows.low, rows.high)), axis=0)
+    violation = jnp.where(jnp.isfinite(violation), violation, jnp.inf)
+    shifted = rows.value + state.multipliers / state.penalty
+    outside = distance_to_interval(shifted, rows.low, rows.high) != 0
+    active = outside | (rows.low == rows.high)
+    residual = jnp.where(outside, distance_to_interval(shifted, rows.aim_low, rows.aim_high), 0.0)
+    squared = jnp.sum(residual * residual, axis=0)
+
+    jacobian = jnp.where(active[:, None], rows.jacobian, 0.0)
+    jacobian = jnp.where(state.pressed[None], 0.0, jacobian)
+    move = -_damped_least_norm(jacobian, residual, settings.damping * squared + 1e-6)
+    largest = jnp.max(jnp.abs(move), axis=0)
+    move = move * jnp.minimum(1.0, settings.max_step / jnp.maximum(largest, 1e-12))
+    least, most = system.room(state.x, data)
+    pressed = (move < least) | (move > most)
+    move = jnp.clip(move, least, most)
+    moving = (violation > settings.tolerance) & jnp.isfinite(squared)
+    x = jax.tree.map(lambda new, old: jnp.where(moving, new, old), system.retract(state.x, move), state.x)
+    state = state._replace(
+        x=x,
+        pressed=pressed,
+        iteration=state.iteration + moving,
+        violation=violation,
+        residual=jnp.where(jnp.isfinite(squared), squared, jnp.inf),
+    )
+    if settings.multiplier_period:
+        state = _update_multipliers(state, residual, moving, settings)
+    return state
+
+
+def _update_multipliers(state: State, residual: jax.Array, moving: jax.Array, settings: Settings) -> State:
+    """First-order update `y <- rho * d(c + y / rho)`; rho grows where the violation did not halve."""
+    due = moving & (state.iteration % settings.multiplier_period == 0)
+    slow = state.violation > 0.5 * state.updated
+    multipliers = jnp.where(due, state.penalty * residual, state.multipliers)
+    penalty = jnp.where(due & slow, state.penalty * settings.penalty_growth, state.penalty)
+    return state._replace(multipliers=multipliers, penalty=penalty, updated=jnp.where(due, state.violation, state.updated))
+
+
+def finished(state: State, settings: Settings) -> jax.Array:
+    """Lanes `(lanes,)` that need no further step: feasible, out of iterations, stalled, or not finite."""
+    stalled = (state.iteration >= settings.stall_after) & (state.residual > settings.stall_ratio * state.checked)
+    if settings.multiplier_period:
+        stalled = jnp.zeros_like(stalled)
+    broken = (state.iteration > 0) & ~jnp.isfinite(state.residual)
+    return (state.violation <= settings.tolerance) | (state.iteration >= settings.max_iterations) | stalled | broken
+
+
+def _weighted_rows(jacobian: jax.Array, weights: jax.Array) -> jax.Array:
+    """`J^T w` per lane: `(m, n, lanes)`, `(m, lanes)` -> `(n, lanes)`."""
+    return sum(jacobian[k] * weights[k] for k in range(1, jacobian.shape[0])) + jacobian[0] * weights[0]
+
+
+def _damped_least_norm(jacobian: jax.Array, residual: jax.Array, damping: jax.Array) -> jax.Array:
+    """`J^T (J J^T + mu I)^-1 d` per lane: jacobian `(m, n, lanes)`, residual `(m, lanes)`, damping `(lanes,)` -> `(n, lanes)`."""
+    m, n, _ = jacobian.shape
+    gram = damping * jnp.eye(m, dtype=jacobian.dtype)[..., None]
+    for i in range(n):
+        gram = gram + jacobian[:, None, i] * jacobian[None, :, i]
+    return _weighted_rows(jacobian, cholesky_solve(gram, residual))
+
+
+def cholesky_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """Solves symmetric positive definite systems per lane: matrix `(m, m, lanes)`, right `(m, lanes)` -> `(m, lanes)`."""
+    m = matrix.shape[0]
+    if m > UNROLLED_ROWS:
+        return _cholesky_solve_looped(matrix, right)
+    lower: list[list[jax.Array]] = [[jnp.zeros(())] * m for _ in range(m)]
+    inverse_diagonal = []
+    for j in range(m):
+        pivot = matrix[j, j]
+        for k in range(j):
+            pivot = pivot - lower[j][k] * lower[j][k]
+        inverse_diagonal.append(lax.rsqrt(pivot))
+        for i in range(j + 1, m):
+            entry = matrix[i, j]
+            for k in range(j):
+                entry = entry - lower[i][k] * lower[j][k]
+            lower[i][j] = entry * inverse_diagonal[j]
+    y: list[jax.Array] = []
+    for i in range(m):
+        value = right[i]
+        for k in range(i):
+            value = value - lower[i][k] * y[k]
+        y.append(value * inverse_diagonal[i])
+    for i in reversed(range(m)):
+        value = y[i]
+        for k in range(i + 1, m):
+            value = value - lower[k][i] * y[k]
+        y[i] = value * inverse_diagonal[i]
+    return jnp.stack(y)
+
+
+UNROLLED_ROWS = 8
+"""Above this many rows the factorisation runs in loops: unrolled it would compile for seconds."""
+
+
+def _cholesky_solve_looped(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    m, _, lanes = matrix.shape
+    rank = jnp.arange(m)[:, None]
+
+    # Row j of `upper` is the j-th column of the factor L, so that every access is a whole row.
+    def factor(j: jax.Array, upper: jax.Array) -> jax.Array:
+        column = matrix[j] - jnp.sum(upper * upper[:, j][:, None], axis=0)
+        column = column * lax.rsqrt(column[j])
+        return lax.dynamic_update_index_in_dim(upper, jnp.where(rank >= j, column, 0.0), j, 0)
+
+    upper = lax.fori_loop(0, m, factor, jnp.zeros_like(matrix))
+
+    def forward(j: jax.Array, rest: jax.Array) -> jax.Array:
+        solved = rest[j] / upper[j, j]
+        rest = rest - jnp.where(rank > j, upper[j] * solved, 0.0)
+        return lax.dynamic_update_index_in_dim(rest, solved, j, 0)
+
+    y = lax.fori_loop(0, m, forward, right)
+
+    def backward(i: jax.Array, solution: jax.Array) -> jax.Array:
+        j = m - 1 - i
+        rest = jnp.sum(jnp.where(rank > j, upper[j] * solution, 0.0), axis=0)
+        return lax.dynamic_update_index_in_dim(solution, (solution[j] - rest) / upper[j, j], j, 0)
+
+    return lax.fori_loop(0, m, backward, y)
+
+
+class Projection(NamedTuple):
+    """Outcome per lane or task."""
+
+    x: PyTree
+    feasible: jax.Array  # (lanes,) bool: every row within the tolerance
+    violation: jax.Array  # (lanes,) largest row violation
+    iterations: jax.Array  # (lanes,) int32
+
+
+def _outcome(state: State, settings: Settings) -> Projection:
+    return Projection(state.x, state.violation <= settings.tolerance, state.violation, state.iteration)
+
+
+def project(system: System, x: PyTree, data: PyTree, settings: Settings) -> Projection:
+    """Projects every lane's seed; runs until all lanes have finished."""
+
+    def body(state: State) -> State:
+        checked = state.residual
+        state = lax.fori_loop(0, settings.check_period, lambda _, s: step(system, s, data, settings), state)
+        return state._replace(checked=checked)
+
+    state = lax.while_loop(lambda s: ~jnp.all(finished(s, settings)), body, init(system, x, data, settings))
+    return _outcome(state, settings)
+
+
+def project_queue(
+    system: System, seeds: PyTree, tasks: PyTree, shared: PyTree, count: jax.Array, lanes: int, settings: Settings
+) -> Projection:
+    """Projects a queue of tasks with a fixed number of lanes, each refilled as soon as it has finished.
+
+    `seeds` and `tasks` have the tasks on their last axis, `(..., N)`; `shared` is the same for all. Only the first `count`
+    (traced) tasks run. The outcome has N entries; those from `count` on are infeasible and meaningless.
+    """
+    total = jax.tree.leaves(seeds)[0].shape[-1]
+
+    def take(tree: PyTree, index: jax.Array) -> PyTree:
+        return jax.tree.map(lambda a: jnp.take(a, index, axis=-1, mode="clip"), tree)
+
+    first = jnp.arange(lanes, dtype=jnp.int32)
+    data = (take(tasks, first), shared)
+    blank = init(system, take(seeds, first), data, settings)
+    results = Projection(
+        seeds, jnp.zeros((total,), bool), jnp.full((total,), jnp.inf, blank.violation.dtype), jnp.zeros((total,), jnp.int32)
+    )
+    Carry = tuple[State, PyTree, jax.Array, jax.Array, Projection]
+
+    def busy(carry: Carry) -> jax.Array:
+        return jnp.any(carry[2] < count)
+
+    def body(carry: Carry) -> Carry:
+        state, lane_tasks, ids, following, results = carry
+        checked = state.residual
+        state = lax.fori_loop(
+            0, settings.check_period, lambda _, s: step(system, s, (lane_tasks, shared), settings), state
+        )
+        state = state._replace(checked=checked)
+        done = finished(state, settings) & (ids < count)
+        where = jnp.where(done, ids, total)
+        outcome = _outcome(state, settings)
+        results = jax.tree.map(lambda all_, new: all_.at[..., where].set(new, mode="drop"), results, outcome)
+        ids = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, ids)
+        following = following + jnp.sum(done, dtype=jnp.int32)
+        fresh_x, fresh_tasks = take(seeds, ids), take(tasks, ids)
+        choose = lambda new, old: jnp.where(done, new, old)  # noqa: E731
+        state = State(
+            x=jax.tree.map(choose, fresh_x, state.x),
+            **{
+                name: jnp.where(done, getattr(blank, name), getattr(state, name))
+                for name in State._fields
+                if name != "x"
+            },
+        )
+        return state, jax.tree.map(choose, fresh_tasks, lane_tasks), ids, following, results
+
+    carry = (blank, data[0], first, jnp.asarray(lanes, jnp.int32), results)
+    return lax.while_loop(busy, body, carry)[4]

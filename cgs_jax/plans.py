@@ -1,0 +1,680 @@
+"""How a conditional problem is evaluated: words of poses.
+
+A new pose that occurs in one closed loop whose other factors are known need not be an unknown: the loop *defines* it, exactly
+and at every iterate (t = T_world_gripper(q)^-1 T_world_object, say). Substituting the definitions leaves fewer unknowns and
+rows, and seeds of configurations only.
+
+What remains is one *word* per product that rows are read from: a sequence of atoms (given poses, touch sites, tools of new
+configurations, free poses) or their inverses. Words are data. A device program depends only on a `Layout`, the numbers of new
+configurations, free poses and rows, so that the dozens of conditional problems of a task share a handful of compiled programs,
+and another robot, switch or constant is another argument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cgs_jax.augmented_lagrangian import Rows
+from cgs_jax.constraints import (
+    Declaration,
+    Function,
+    FunctionArgument,
+    PoseRows,
+    Product,
+    RowData,
+    Term,
+    function_rows,
+    inverted,
+    pose_rows,
+)
+from cgs_jax.kinematics import Chain, joint_frames, tool_jacobian, tool_pose
+from cgs_jax.poses import Array, Pose, cross, matmul, matvec, retract, transpose
+
+# ------------------------------------------------------------------ structure
+
+
+class FunctionSlot(NamedTuple):
+    """A user's function and where its arguments are: ("configuration", position) or ("word", position)."""
+
+    function: Function
+    arguments: tuple[tuple[str, int], ...]
+    constraint: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a device program is compiled for. Atoms: identity, given poses, touch sites, tools, free poses."""
+
+    joints: int
+    """Joints of the longest chain; shorter ones are padded with joints that do not move."""
+    configurations: int
+    """New configurations K, each a block of `joints` unknowns."""
+    chains: int
+    """Tools per configuration."""
+    free: int
+    """Free poses F, each a block of six unknowns."""
+    words: int
+    """Words that rows are read from, six rows each."""
+    given: int
+    """Room for given poses."""
+    sites: int
+    """Room for touch sites."""
+    length: int
+    """Room for atoms in a word."""
+    tool_places: int
+    """Room for occurrences of tools in words."""
+    free_places: int
+    """Room for occurrences of free poses in words."""
+    constraints: int
+    """Room for constraints in the report of violations."""
+    functions: tuple[FunctionSlot, ...] = ()
+    """A user's functions; a program that has any serves one problem only."""
+
+    @property
+    def unknowns(self) -> int:
+        """Number n of unknowns."""
+        return self.joints * self.configurations + 6 * self.free
+
+    @property
+    def tools(self) -> int:
+        """Number of tools."""
+        return self.configurations * self.chains
+
+    @property
+    def first_site(self) -> int:
+        """Atom of the first site."""
+        return 1 + self.given
+
+    @property
+    def first_tool(self) -> int:
+        """Atom of the first tool."""
+        return self.first_site + self.sites
+
+    @property
+    def first_free(self) -> int:
+        """Atom of the first free pose."""
+        return self.first_tool + self.tools
+
+    @property
+    def solves(self) -> bool:
+        """Whether there is anything to solve: without, drawing the free poses is all."""
+        return bool(self.configurations or self.functions) or self.words > self.free
+
+
+class Words(NamedTuple):
+    """Products as atoms, traced; padded with the identity."""
+
+    atom: Array  # (words, length) int32
+    inverted: Array  # (words, length) bool
+    length: Array  # () int32 of the longest
+
+
+class Places(NamedTuple):
+    """Where moving atoms of one kind occur in the words, traced; one entry per occurrence."""
+
+    word: Array  # (places,) int32
+    position: Array  # (places,) int32
+    source: Array  # (places,) int32 tool or free pose
+    block: Array  # (places,) int32 configuration or free pose; -1 for an unused entry
+    inverted: Array  # (places,) bool
+
+
+class Code(NamedTuple):
+    """All words of a plan."""
+
+    words: Words
+    tools: Places
+    free: Places
+    outputs: Words  # words of the new poses
+    stage: Array  # (words,) int32 number of configurations that a word needs
+    constraint: Array  # (words,) int32 position of its constraint; `constraints` where it has none
+
+
+OUTPUTS = 4
+"""Room for new poses in the output of a program; problems with fewer share it."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A conditional problem as words: structure, data, and the names behind the positions."""
+
+    layout: Layout
+    code: Code
+    configurations: tuple[str, ...]
+    """New configurations, in order."""
+    given: tuple[Term, ...]
+    """What the given atoms are, from atom 1 on: pose variables, constants, tools of given configurations."""
+    sites: tuple[str, ...]
+    """Constraint whose touch site each site atom is."""
+    tools: tuple[tuple[str, ...], ...]
+    """Chains of each new configuration."""
+    free: tuple[tuple[str, str | None], ...]
+    """Free poses, each with the constraint that its seed is drawn from."""
+    rows: tuple[str, ...]
+    """Constraint of each word; "" for a word that only a user's function reads."""
+    poses: tuple[str, ...]
+    """New pose variables in the order of the output words."""
+    given_configurations: tuple[str, ...]
+    """Given configurations that a user's function reads."""
+
+
+def make_plan(
+    new: Sequence[str],
+    declarations: Mapping[str, Declaration],
+    dofs: Mapping[str, int | None],
+    lengths: Mapping[str, int],
+    joints: int,
+    sites: int,
+) -> Plan:
+    """Plans the conditional problem of `new` variables under active constraints.
+
+    `dofs` has each configuration variable's number of joints, None for a pose; `lengths` the joints of each chain; `joints`
+    and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). Poses are defined greedily: configurations are taken one by one, always the
+    one that completes most products; where every loop left has two or more unknown poses, one of them becomes free.
+    """
+    new_poses = [name for name in new if dofs[name] is None]
+    new_configurations = [name for name in new if dofs[name] is not None]
+    free: list[str] = []
+    while True:
+        order, defined, read, undetermined = _eliminate(new_configurations, new_poses, free, declarations)
+        if not undetermined:
+            break
+        loops = [d for n, d in declarations.items() if isinstance(d, PoseRows) and d.form == "closed" and n not in read]
+        stuck = [p for d in loops for p in d.scope if p in undetermined]
+        free.append((stuck or undetermined)[0])
+    return _Assembler(order, new_poses, free, defined, read, declarations, dofs, lengths, joints, sites).plan()
+
+
+class _Definition(NamedTuple):
+    constraint: str
+    pose: str
+    value: Product
+    stage: int
+
+
+def _eliminate(
+    configurations: list[str], poses: list[str], free: list[str], declarations: Mapping[str, Declaration]
+) -> tuple[list[str], list[_Definition], dict[str, int], list[str]]:
+    """Order of configurations; definitions in order; constraints read as rows with their stage; poses left undetermined."""
+    new = {*configurations, *poses}
+
+    def propagate(known: set[str], used: set[str], stage: int) -> tuple[list[_Definition], dict[str, int]]:
+        found: list[_Definition] = []
+        rows: dict[str, int] = {}
+        progress = True
+        while progress:
+            progress = False
+            for name, declaration in declarations.items():
+                if name in used:
+                    continue
+                missing = [v for v in declaration.scope if v in new and v not in known]
+                if not missing:
+                    used.add(name)
+                    rows[name] = stage
+                elif len(missing) == 1 and missing[0] in poses and isinstance(declaration, PoseRows):
+                    value = declaration.solved_for(missing[0])
+                    if value is not None:
+                        used.add(name)
+                        known.add(missing[0])
+                        found.append(_Definition(name, missing[0], value, stage))
+                        progress = True
+        return found, rows
+
+    known, used = set(free), set[str]()
+    defined, read = propagate(known, used, 0)
+    order: list[str] = []
+    while len(order) < len(configurations):
+
+        def completes(candidate: str) -> int:
+            found, rows = propagate(known | {candidate}, set(used), 0)
+            return len(found) + len(rows)
+
+        best = max((c for c in configurations if c not in order), key=completes)
+        order.append(best)
+        known.add(best)
+        found, rows = propagate(known, used, len(order))
+        defined += found
+        read |= rows
+    return order, defined, read, [p for p in poses if p not in known]
+
+
+def _rounded(count: int, step: int) -> int:
+    return -(-count // step) * step
+
+
+def _reduced(product: Product) -> Product:
+    """Cancels factors that stand beside their own inverse."""
+    kept: list[Term] = []
+    for term in product:
+        if kept and kept[-1] == term.inverse:
+            kept.pop()
+        else:
+            kept.append(term)
+    return tuple(kept)
+
+
+class _Assembler:
+    """Substitutes the definitions, numbers the atoms and writes the words."""
+
+    def __init__(
+        self,
+        order: list[str],
+        new_poses: list[str],
+        free: list[str],
+        defined: list[_Definition],
+        read: dict[str, int],
+        declarations: Mapping[str, Declaration],
+        dofs: Mapping[str, int | None],
+        lengths: Mapping[str, int],
+        joints: int,
+        sites: int,
+    ) -> None:
+        self.order, self.new_poses, self.free = order, new_poses, free
+        self.declarations, self.dofs, self.lengths, self.joints, self.sites = declarations, dofs, lengths, joints, sites
+        self.values: dict[str, Product] = {}
+        for definition in defined:
+            self.values[definition.pose] = self._substituted(definition.value)
+        self.words: list[tuple[str, Product, int]] = []
+        self.functions: dict[str, Function] = {}
+        for name, stage in read.items():
+            declaration = declarations[name]
+            if isinstance(declaration, PoseRows):
+                self.words.append((name, self._substituted(declaration.product), stage))
+            else:
+                self.functions[name] = declaration
+        # A function reads poses as words without rows.
+        self.read_by_functions = dict.fromkeys(
+            v for f in self.functions.values() for v in f.scope if dofs[v] is None
+        )
+        for name in self.read_by_functions:
+            self.words.append(("", self._substituted((Term("pose", name),)), len(order)))
+
+    def _substituted(self, product: Product) -> Product:
+        result: list[Term] = []
+        for term in product:
+            if term.kind == "pose" and term.name in self.values:
+                value = self.values[term.name]
+                result += inverted(value) if term.inverted else value
+            else:
+                result.append(term)
+        return _reduced(tuple(result))
+
+    def plan(self) -> Plan:
+        outputs = [self._substituted((Term("pose", name),)) for name in self.new_poses]
+        products = [product for _, product, _ in self.words]
+        given: dict[Term, None] = {}
+        tools: dict[str, dict[str, None]] = {name: {} for name in self.order}
+        sites: dict[str, None] = {}
+        for term in (term for product in products + outputs for term in product):
+            if term.kind == "site":
+                sites[term.name] = None
+            elif term.kind == "chain" and term.variable in tools and self.lengths[term.name]:
+                tools[term.variable][term.name] = None
+            elif term.kind != "pose" or term.name not in self.free:
+                given[Term(term.kind, term.name, term.variable)] = None
+        chains = max([len(names) for names in tools.values()], default=1) or 1
+        words = max(len(products), len(self.order) + len(self.free), 1)
+        first_tool = 1 + _rounded(max(len(given), 1), 6) + self.sites
+        atoms: dict[Term, int] = {term: 1 + i for i, term in enumerate(given)}
+        atoms |= {Term("site", name): first_tool - self.sites + i for i, name in enumerate(sites)}
+        for k, name in enumerate(self.order):
+            for i, chain in enumerate(tools[name]):
+                atoms[Term("chain", chain, name)] = first_tool + k * chains + i
+        first_free = first_tool + len(self.order) * chains
+        atoms |= {Term("pose", name): first_free + i for i, name in enumerate(self.free)}
+        constraints = list(self.declarations)
+        of_configurations = _places(products, lambda t: self.order.index(t.variable) if t.variable in self.order else -1)
+        of_free = _places(products, lambda t: self.free.index(t.name) if t.kind == "pose" and t.name in self.free else -1)
+        layout = Layout(
+            joints=self.joints if self.order else 0,
+            configurations=len(self.order),
+            chains=chains,
+            free=len(self.free),
+            words=words,
+            given=first_tool - self.sites - 1,
+            sites=self.sites,
+            length=_rounded(max(len(product) for product in products + outputs), 12),
+            tool_places=_rounded(len(of_configurations), 2 * words) if self.order else 0,
+            free_places=_rounded(len(of_free), words) if self.free else 0,
+            constraints=_rounded(len(constraints), 16),
+            functions=tuple(
+                FunctionSlot(f, tuple(self._argument(v) for v in f.scope), constraints.index(name))
+                for name, f in self.functions.items()
+            ),
+        )
+        stage = np.full(words, len(self.order) + 1, np.int32)
+        constraint = np.full(words, layout.constraints, np.int32)
+        for i, (name, _, needed) in enumerate(self.words):
+            if name:
+                stage[i], constraint[i] = needed, constraints.index(name)
+        code = Code(
+            words=_words(products, atoms, words, layout.length),
+            tools=_place_arrays(of_configurations, atoms, first_tool, layout.tool_places),
+            free=_place_arrays(of_free, atoms, first_free, layout.free_places),
+            outputs=_words(outputs, atoms, max(OUTPUTS, len(outputs)), layout.length),
+            stage=stage,
+            constraint=constraint,
+        )
+        return Plan(
+            layout=layout,
+            code=code,
+            configurations=tuple(self.order),
+            given=tuple(given),
+            sites=tuple(sites),
+            tools=tuple(tuple(tools[name]) for name in self.order),
+            free=tuple((name, self._seed_of(name)) for name in self.free),
+            rows=tuple(name for name, _, _ in self.words),
+            poses=tuple(self.new_poses),
+            given_configurations=tuple(self._function_configurations()),
+        )
+
+    def _function_configurations(self) -> list[str]:
+        scopes = [v for f in self.functions.values() for v in f.scope]
+        return list(dict.fromkeys(v for v in scopes if self.dofs[v] is not None and v not in self.order))
+
+    def _argument(self, variable: str) -> tuple[str, int]:
+        if self.dofs[variable] is None:
+            own = len(self.words) - len(self.read_by_functions)
+            return "word", own + list(self.read_by_functions).index(variable)
+        return "configuration", [*self.order, *self._function_configurations()].index(variable)
+
+    def _seed_of(self, pose: str) -> str | None:
+        """The constraint on a free pose alone that its seed is drawn from."""
+        for name, declaration in self.declarations.items():
+            if isinstance(declaration, PoseRows) and declaration.scope == (pose,):
+                return name
+        return None
+
+
+class _Place(NamedTuple):
+    word: int
+    position: int
+    term: Term
+    block: int
+
+
+def _places(products: list[Product], block_of: Callable[[Term], int]) -> list[_Place]:
+    return [
+        _Place(w, i, term, block_of(term))
+        for w, product in enumerate(products)
+        for i, term in enumerate(product)
+        if block_of(term) >= 0
+    ]
+
+
+def _place_arrays(places: list[_Place], atoms: Mapping[Term, int], first: int, room: int) -> Places:
+    rows = []
+    for place in places:
+        plain = Term(place.term.kind, place.term.name, place.term.variable)
+        rows.append((place.word, place.position, atoms[plain] - first, place.block, place.term.inverted))
+    rows += [(0, 0, 0, -1, False)] * (room - len(rows))
+    columns = np.array(rows, np.int32).reshape(room, 5).T
+    return Places(columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool))
+
+
+def _words(products: list[Product], atoms: Mapping[Term, int], room: int, length: int) -> Words:
+    atom, flips = np.zeros((room, length), np.int32), np.zeros((room, length), bool)
+    for w, product in enumerate(products):
+        for i, term in enumerate(product):
+            atom[w, i] = atoms[Term(term.kind, term.name, term.variable)]
+            flips[w, i] = term.inverted
+    return Words(atom, flips, np.asarray(max([len(product) for product in products], default=0), np.int32))
+
+
+# ------------------------------------------------------------------ evaluation
+
+
+class Shared(NamedTuple):
+    """What all tasks of a call have in common."""
+
+    code: Code
+    chains: Chain  # stacked on the last axis: tools of the new configurations in order, (..., tools)
+    rows: RowData  # stacked on the last axis, (..., words)
+
+
+class Tasks(NamedTuple):
+    """What differs from task to task; lanes last."""
+
+    given: Pose  # (given + sites, 3, 3, lanes), (given + sites, 3, lanes)
+    low: Array  # (configurations, joints, lanes) limits that the solver keeps to
+    high: Array  # (configurations, joints, lanes)
+    slack: Array  # (2, lanes) in [0, 1): how far inside an interval a violated row is pulled
+    configurations: tuple[Array, ...]  # given ones that functions read, (dof, lanes)
+
+
+class Point(NamedTuple):
+    """Values of the unknowns; lanes last."""
+
+    configurations: Array  # (configurations, joints, lanes)
+    free: Pose  # (free, 3, 3, lanes), (free, 3, lanes)
+
+
+def _pick(array: jax.Array, indices: jax.Array) -> jax.Array:
+    """Rows of the first axis, as dynamic slices: XLA's CPU gather goes element by element."""
+    return jnp.stack([lax.dynamic_index_in_dim(array, indices[i], 0, keepdims=False) for i in range(indices.shape[0])])
+
+
+def multiply_words(words: Words, atoms: Pose) -> Pose:
+    """Prefix products of all words, `(length + 1, words, 3, 3, lanes)` and `(length + 1, words, 3, lanes)`.
+
+    `atoms` is `(atoms, 3, 3, lanes)`, `(atoms, 3, lanes)`. Entry l is the product of the first l factors; entries beyond the
+    longest word are zero, those beyond a shorter word repeat its product.
+    """
+    count, length = words.atom.shape
+    lanes = atoms.position.shape[-1]
+    dtype = atoms.position.dtype
+    rotation = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[None, ..., None], (count, 3, 3, lanes))
+    position = jnp.zeros((count, 3, lanes), dtype)
+    rotations = jnp.zeros((length + 1, *rotation.shape), dtype).at[0].set(rotation)
+    positions = jnp.zeros((length + 1, *position.shape), dtype)
+
+    def body(i: jax.Array, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        rotation, position, rotations, positions = state
+        index = words.atom[:, i]
+        flips = words.inverted[:, i]
+        rotation, position = times(
+            Pose(rotation, position), Pose(_pick(atoms.rotation, index), _pick(atoms.position, index)), flips
+        )
+        return (
+            rotation,
+            position,
+            lax.dynamic_update_index_in_dim(rotations, rotation, i + 1, 0),
+            lax.dynamic_update_index_in_dim(positions, position, i + 1, 0),
+        )
+
+    _, _, rotations, positions = lax.fori_loop(0, words.length, body, (rotation, position, rotations, positions))
+    return Pose(rotations, positions)
+
+
+def times(product: Pose, factor: Pose, flips: jax.Array) -> Pose:
+    """Products with the factors or, where `flips` `(words,)`, with their inverses; `(words, 3, 3, *lanes)` layout."""
+    left, move = jnp.moveaxis(product.rotation, 0, 2), jnp.moveaxis(product.position, 0, 1)
+    right, shift = jnp.moveaxis(factor.rotation, 0, 2), jnp.moveaxis(factor.position, 0, 1)
+    flips = flips.reshape(flips.shape + (1,) * (shift.ndim - 2))
+    right = jnp.where(flips, transpose(right), right)
+    shift = jnp.where(flips, -matvec(right, shift), shift)
+    return Pose(jnp.moveaxis(matmul(left, right), 2, 0), jnp.moveaxis(move + matvec(left, shift), 1, 0))
+
+
+def tools_at(layout: Layout, chains: Chain, configurations: Array) -> tuple[Pose, jax.Array]:
+    """Tools `(tools, 3, 3, lanes)`, `(tools, 3, lanes)` and their Jacobians `(tools, 6, joints, lanes)`."""
+    if not layout.configurations:
+        lanes = configurations.shape[-1]
+        none = Pose(jnp.zeros((0, 3, 3, lanes)), jnp.zeros((0, 3, lanes)))
+        return none, jnp.zeros((0, 6, layout.joints, lanes))
+    # Tools are evaluated beside each other: (joints, tools, lanes).
+    q = jnp.swapaxes(jnp.repeat(configurations, layout.chains, axis=0), 0, 1)
+    frames = joint_frames(chains, q)
+    tool = tool_pose(chains, frames)
+    jacobian = jnp.moveaxis(tool_jacobian(chains, frames, tool), 2, 0)
+    return Pose(jnp.moveaxis(tool.rotation, 2, 0), jnp.moveaxis(tool.position, 1, 0)), jacobian
+
+
+def all_atoms(given: Pose, tools: Pose, free: Pose) -> Pose:
+    """Identity, given poses and sites, tools, free poses, in the order of their numbers."""
+    lanes = given.position.shape[-1]
+    dtype = given.position.dtype
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[None, ..., None], (1, 3, 3, lanes))
+    return Pose(
+        jnp.concatenate([eye, given.rotation, tools.rotation, free.rotation]),
+        jnp.concatenate([jnp.zeros((1, 3, lanes), dtype), given.position, tools.position, free.position]),
+    )
+
+
+def _carried(places: Places, tangents: jax.Array, sources: Pose, prefixes: Pose, blocks: int) -> jax.Array:
+    """Derivatives of the words by one kind of atom: `(words, blocks, 6, n, lanes)`.
+
+    `tangents` `(sources, 6, n, lanes)` moves the atom itself. With the product (R, p) before the atom and the word's origin e,
+    an atom (S, s; v, w) moves the word by `R v + (R w) x (e - p')`, where p' is the product's origin after the atom, and turns
+    it by `R w`. An inverse moves by `S^T (w x s - v)` and turns by `-S^T w`; `R S^T` is the rotation after it.
+    """
+    words = prefixes.rotation.shape[1]
+    result = 0.0
+    for i in range(places.word.shape[0]):
+        word, position, flips = places.word[i], places.position[i], places.inverted[i]
+        before = prefixes.rotation[position, word]
+        after, origin = prefixes.rotation[position + 1, word], prefixes.position[position + 1, word]
+        end = prefixes.position[-1, word]
+        tangent = lax.dynamic_index_in_dim(tangents, places.source[i], 0, keepdims=False)
+        place = lax.dynamic_index_in_dim(sources.position, places.source[i], 0, keepdims=False)
+        turn = tangent[3:]
+        move = tangent[:3] - jnp.where(flips, 1.0, 0.0) * cross(turn, place[:, None])
+        carrier = jnp.where(flips, -after, before)[:, :, None]
+        turned = matvec(carrier, turn)
+        moved = matvec(carrier, move) + cross(turned, (end - origin)[:, None])
+        hit = (jnp.arange(words)[:, None] == word) & (jnp.arange(blocks)[None] == places.block[i])
+        part = jnp.concatenate([moved, turned])
+        result = result + jnp.where(hit[:, :, None, None, None], part, 0.0)
+    return result
+
+
+class PlanSystem:
+    """A layout as the solver's `System`."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+
+    def _products(self, x: Point, tasks: Tasks, shared: Shared) -> tuple[Pose, Pose, jax.Array, Pose]:
+        """Atoms; prefix products with the whole words as last entry; tool Jacobians; tools."""
+        tools, jacobians = tools_at(self.layout, shared.chains, x.configurations)
+        atoms = all_atoms(tasks.given, tools, x.free)
+        prefixes = multiply_words(shared.code.words, atoms)
+        last = shared.code.words.length
+        prefixes = Pose(
+            prefixes.rotation.at[-1].set(prefixes.rotation[last]), prefixes.position.at[-1].set(prefixes.position[last])
+        )
+        return atoms, prefixes, jacobians, tools
+
+    def rows(self, x: Point, data: tuple[Tasks, Shared]) -> Rows:
+        """All rows with their Jacobian; violated bounds are pulled inside by each lane's own slack."""
+        tasks, shared = data
+        layout, code = self.layout, shared.code
+        lanes = tasks.slack.shape[-1]
+        _, prefixes, jacobians, tools = self._products(x, tasks, shared)
+        parts = []
+        if layout.configurations:
+            tangent = _carried(code.tools, jacobians, tools, prefixes, layout.configurations)
+            tangent = jnp.moveaxis(tangent, 1, 2).reshape(layout.words, 6, -1, lanes)
+            parts.append(tangent)
+        if layout.free:
+            identity = jnp.broadcast_to(jnp.eye(6)[None, ..., None], (layout.free, 6, 6, lanes))
+            tangent = _carried(code.free, identity, x.free, prefixes, layout.free)
+            parts.append(jnp.moveaxis(tangent, 1, 2).reshape(layout.words, 6, -1, lanes))
+        tangents = jnp.concatenate(parts, axis=2)  # (words, 6, n, lanes)
+        pose = Pose(jnp.moveaxis(prefixes.rotation[-1], 0, 2), jnp.moveaxis(prefixes.position[-1], 0, 1))
+        measured = pose_rows(pose, _with_lane(shared.rows))
+        value = jnp.moveaxis(measured.value, 1, 0).reshape(6 * layout.words, lanes)
+        jacobian = jnp.concatenate([tangents[:, :3], _turn_rows(measured.turn, tangents[:, 3:])], axis=1)
+        jacobian = jacobian.reshape(6 * layout.words, layout.unknowns, lanes)
+        low, high = (jnp.asarray(bound).T.reshape(-1, 1) for bound in (shared.rows.low, shared.rows.high))
+        for slot in layout.functions:
+            arguments = self._arguments(slot, x, tasks, prefixes, tangents)
+            more, slope = function_rows(slot.function, arguments, layout.unknowns)
+            size = slot.function.rows
+            value = jnp.concatenate([value, jnp.broadcast_to(more, (size, lanes))])
+            jacobian = jnp.concatenate([jacobian, jnp.broadcast_to(slope, (size, layout.unknowns, lanes))])
+            least = 0.0 if slot.function.kind == "equality" else -jnp.inf
+            low = jnp.concatenate([low, jnp.full((size, 1), least)])
+            high = jnp.concatenate([high, jnp.zeros((size, 1))])
+        width = high - low
+        inside = jnp.where(jnp.isfinite(width), 0.5 * width, 0.0)
+        return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
+
+    def _arguments(
+        self, slot: FunctionSlot, x: Point, tasks: Tasks, prefixes: Pose, tangents: jax.Array | None
+    ) -> dict[str, FunctionArgument]:
+        layout = self.layout
+        arguments = {}
+        for name, (kind, at) in zip(slot.function.scope, slot.arguments, strict=True):
+            if kind == "word":
+                pose = Pose(prefixes.rotation[-1, at], prefixes.position[-1, at])
+                arguments[name] = FunctionArgument(pose, None if tangents is None else tangents[at])
+            elif at >= layout.configurations:
+                arguments[name] = FunctionArgument(tasks.configurations[at - layout.configurations], None)
+            else:
+                identity = jnp.eye(layout.joints, layout.unknowns, at * layout.joints)[..., None]
+                arguments[name] = FunctionArgument(x.configurations[at], identity)
+        return arguments
+
+    def room(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, jax.Array]:
+        """Joint limits; poses are unbounded."""
+        tasks, _ = data
+        lanes = tasks.slack.shape[-1]
+        joints = self.layout.joints * self.layout.configurations
+        unbounded = jnp.full((6 * self.layout.free, lanes), jnp.inf)
+        least = (tasks.low - x.configurations).reshape(joints, lanes)
+        most = (tasks.high - x.configurations).reshape(joints, lanes)
+        return jnp.concatenate([least, -unbounded]), jnp.concatenate([most, unbounded])
+
+    def retract(self, x: Point, step: jax.Array) -> Point:
+        """Adds to the configurations, moves the free poses."""
+        joints = self.layout.joints * self.layout.configurations
+        q = x.configurations + step[:joints].reshape(x.configurations.shape)
+        if not self.layout.free:
+            return Point(q, x.free)
+        poses = [
+            retract(Pose(x.free.rotation[f], x.free.position[f]), step[joints + 6 * f : joints + 6 * f + 6])
+            for f in range(self.layout.free)
+        ]
+        return Point(q, Pose(jnp.stack([p.rotation for p in poses]), jnp.stack([p.position for p in poses])))
+
+    def violations(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, Pose]:
+        """Largest violation per constraint `(constraints, lanes)`, m or rad, and the new poses `(outputs, 3, 3, lanes)`."""
+        tasks, shared = data
+        layout = self.layout
+        lanes = tasks.slack.shape[-1]
+        atoms, prefixes, _, _ = self._products(x, tasks, shared)
+        pose = Pose(jnp.moveaxis(prefixes.rotation[-1], 0, 2), jnp.moveaxis(prefixes.position[-1], 0, 1))
+        value = pose_rows(pose, _with_lane(shared.rows)).value
+        low, high = (jnp.asarray(bound)[..., None] for bound in (shared.rows.low, shared.rows.high))
+        worst = jnp.max(jnp.abs(value - jnp.clip(value, low, high)), axis=0)  # (words, lanes)
+        worst = jnp.where(jnp.isfinite(worst), worst, jnp.inf)
+        result = jnp.zeros((layout.constraints + 1, lanes), value.dtype).at[shared.code.constraint].max(worst)
+        for slot in layout.functions:
+            more, _ = function_rows(slot.function, self._arguments(slot, x, tasks, prefixes, None), layout.unknowns)
+            gap = jnp.abs(more) if slot.function.kind == "equality" else jnp.maximum(more, 0.0)
+            gap = jnp.where(jnp.isfinite(gap), gap, jnp.inf)
+            result = result.at[slot.constraint].max(jnp.broadcast_to(jnp.max(gap, axis=0), (lanes,)))
+        outputs = multiply_words(shared.code.outputs, atoms)
+        last = shared.code.outputs.length
+        return result[: layout.constraints], Pose(outputs.rotation[last], outputs.position[last])
+
+
+def _with_lane(rows: RowData) -> RowData:
+    return jax.tree.map(lambda a: jnp.asarray(a)[..., None], rows)
+
+
+def _turn_rows(turn: jax.Array, angular: jax.Array) -> jax.Array:
+    """`turn` (3, 3, words, lanes) times angular velocities (words, 3, n, lanes) -> (words, 3, n, lanes)."""
+    rows = [
+        turn[i, 0][:, None] * angular[:, 0] + turn[i, 1][:, None] * angular[:, 1] + turn[i, 2][:, None] * angular[:, 2]
+        for i in range(3)
+    ]
+    return jnp.stack(rows, axis=1)
