@@ -245,6 +245,17 @@ def test_collision_pairs_are_those_that_mujoco_tests(loaded, name):
     assert tested == set(scene.collision_pairs())
 
 
+@pytest.mark.parametrize(("name", "instance"), INSTANCES)
+def test_no_capsule_can_pass_through_a_face_of_a_box_unseen(loaded, name, instance):
+    """MuJoCo finds no contact of a capsule whose ends are both farther than its radius from the box it pierces."""
+    model = loaded[name, instance].model
+    for pair in loaded[name, instance].collision_pairs():
+        by_type = {scenes.COLLISION_GEOMS[mujoco.mjtGeom(int(model.geom_type[geom]))]: geom for geom in pair}
+        if by_type.keys() == {"capsule", "box"}:
+            radius, half = model.geom_size[by_type["capsule"]][:2]
+            assert 2 * half - 2 * radius <= 2 * model.geom_size[by_type["box"]].min() + 1e-9, pair
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_excluded_pairs_are_at_most_two_joints_apart_and_each_has_its_reason(loaded, name):
     model = loaded[name, 0].model
@@ -479,7 +490,7 @@ def test_instance_out_of_range(instance):
         ("handover", "geom.wall = {", "geom.a_hand = {", ["a_hand", "fromto"]),
         ("handover", "geom.wall = {", "joint.wall = {", ["unknown key 'joint'", "body, geom, site"]),
         ("handover", "geom.wall = { pos", "geom.wall = { mass", ["unknown key 'mass'", "pos, quat, size"]),
-        ("handover", "size = [0.02, 0.50, 0.25]", "size = [0.02, 0, 0.25]", ["'size' must be positive"]),
+        ("handover", "size = [0.025, 0.50, 0.25]", "size = [0.025, 0, 0.25]", ["'size' must be positive"]),
         ("handover", "placement.p = {", "placement.x = {", ["placement.x", "available: p"]),
         ("banana", 'sites = ["box_top"]', 'sites = ["lid"]', ["no site 'lid'", "t_x", "box_top"]),
         ("banana", 'sites = ["box_top"]', 'sites = ["banana_tip"]', ["banana_tip", "not on object 'box'"]),
@@ -500,8 +511,8 @@ def test_mistakes_in_the_task_file(edited, name, old, new, words):
     ("old", "new", "words"),
     [
         ("<worldbody>", "<worldbod>", ["handover.xml", "Line number"]),
-        ('type="box" size="1.3 .9 .05"', 'type="box"', ["handover.xml does not compile", "size"]),
-        ('<geom name="table" type="box" size="1.3 .9 .05"', '<geom name="table" type="plane" size="1 1 .1"',
+        ('type="box" size="1.3 .9 .10"', 'type="box"', ["handover.xml does not compile", "size"]),
+        ('<geom name="table" type="box" size="1.3 .9 .10"', '<geom name="table" type="plane" size="1 1 .1"',
          ["'table'", "'plane'", "sphere, capsule, box"]),
         ('class="obstacle" name="wall"', 'name="wall" type="cylinder"', ["'wall'", "'cylinder'"]),
         ('<freejoint name="box"/>', "", ["handover.xml", "keyframe"]),
@@ -516,7 +527,7 @@ def test_mistakes_in_the_model(edited, old, new, words):
 
 
 def test_a_geom_that_never_collides_may_be_of_any_type(edited):
-    old = '<geom name="table" type="box" size="1.3 .9 .05"'
+    old = '<geom name="table" type="box" size="1.3 .9 .10"'
     new = '<geom type="cylinder" size=".1 .1" contype="0" conaffinity="0"/>' + old
     scene = scenes.load_scene(edited("handover", old, new, suffix="xml"), 0)
     assert scene.model.ngeom == scenes.load_scene("handover", 0).model.ngeom + 1
