@@ -1,3 +1,4 @@
+import importlib.util
 import itertools
 import os
 import subprocess
@@ -15,6 +16,7 @@ from cgs_jax.errors import InputError
 from cgs_jax.samples import SampleSet
 
 ROOT = Path(__file__).parents[1]
+SHOW = ROOT / "scripts" / "show.py"
 CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
 HANDOVER = ROOT / "scenes" / "handover" / "handover.xml"
 
@@ -386,3 +388,79 @@ def test_the_users_own_choice_is_kept(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
     with pytest.raises(InputError, match="switches pictures off"):
         render.backend()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The script
+
+
+@pytest.fixture(scope="module")
+def show():
+    spec = importlib.util.spec_from_file_location("show", SHOW)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_script_writes_sheet_and_gif_beside_the_file(tmp_path, opengl):
+    qpos, t, _ = gantry.valid(3)
+    gantry.sample_set(qpos, t).save(tmp_path)
+    done = subprocess.run(
+        [sys.executable, SHOW, tmp_path, "--size", "160x120"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["samples.gif", "samples.npz", "samples_sheet.png"]
+    assert done.stdout.split() == [str(tmp_path / "samples_sheet.png"), str(tmp_path / "samples.gif")]
+
+
+def test_script_writes_what_is_asked_for(show, tmp_path, capsys, opengl):
+    qpos, t, _ = gantry.valid(5)
+    file = str(gantry.sample_set(qpos, t).save(tmp_path))
+    ghost, sheet = tmp_path / "g.png", tmp_path / "s.png"
+    small = ["--size", "160x120", "--camera", "45,-30"]
+    assert show.main([file, "--ghost", str(ghost), "--samples", "diverse:3", "--switch", "place", *small]) == 0
+    assert show.main([file, "--sheet", str(sheet), "--samples", "4,0", *small]) == 0
+    capsys.readouterr()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["g.png", "s.png", "samples.npz"]
+    assert Image.open(ghost).size[0] == 160
+    np.testing.assert_array_equal(
+        np.asarray(Image.open(sheet)),
+        render.contact_sheet(SampleSet.load(file), [4, 0], (160, 120), render.Camera(45, -30)),
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--samples", "7"], "0 to 2"),
+        (["--samples", "best"], "diverse:6"),
+        (["--samples", "diverse:0"], "diverse:6"),
+        (["--samples", "other:3"], "diverse:6"),
+        (["--switch", "lift"], "pick, place"),
+        (["--size", "640"], "640x480"),
+        (["--size", "9x9"], "64 to 4096"),
+        (["--camera", "x"], "azimuth"),
+        (["--sheet", "a.jpg"], ".png"),
+        (["--gif", "a.png"], ".gif"),
+        (["--view", "--port", "99999999"], "port"),
+    ],
+)
+def test_script_answers_wrong_input_in_one_line(show, tmp_path, capsys, arguments, words):
+    qpos, t, _ = gantry.valid(3)
+    file = gantry.sample_set(qpos, t).save(tmp_path)
+    assert show.main([str(file), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and len(captured.err.splitlines()) == 1 and words in captured.err
+    assert os.listdir(tmp_path) == ["samples.npz"]
+
+
+def test_script_refuses_files_without_samples(show, tmp_path, capsys):
+    qpos, t, _ = gantry.valid(1)
+    empty = gantry.sample_set(qpos, t).select([]).save(tmp_path)
+    for file, words in ((empty, "no samples"), (tmp_path / "no.npz", "no sample file")):
+        assert show.main([str(file)]) == 2
+        error = capsys.readouterr().err
+        assert words in error and len(error.splitlines()) == 1
