@@ -490,7 +490,7 @@ def test_instance_out_of_range(instance):
         ("handover", "geom.wall = {", "geom.a_hand = {", ["a_hand", "fromto"]),
         ("handover", "geom.wall = {", "joint.wall = {", ["unknown key 'joint'", "body, geom, site"]),
         ("handover", "geom.wall = { pos", "geom.wall = { mass", ["unknown key 'mass'", "pos, quat, size"]),
-        ("handover", "size = [0.025, 0.50, 0.25]", "size = [0.025, 0, 0.25]", ["'size' must be positive"]),
+        ("handover", "size = [0.025, 0.50, 0.22]", "size = [0.025, 0, 0.22]", ["'size' must be positive"]),
         ("handover", "placement.p = {", "placement.x = {", ["placement.x", "available: p"]),
         ("banana", 'sites = ["box_top"]', 'sites = ["lid"]', ["no site 'lid'", "t_x", "box_top"]),
         ("banana", 'sites = ["box_top"]', 'sites = ["banana_tip"]', ["banana_tip", "not on object 'box'"]),
