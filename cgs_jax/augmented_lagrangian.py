@@ -13,6 +13,7 @@ have their lanes (independent problems) last.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -266,6 +267,29 @@ def project(system: System, x: PyTree, data: PyTree, settings: Settings) -> Proj
     return _outcome(state, settings)
 
 
+class _Packing:
+    """Lays the leaves of a pytree with lanes last out as one array, and back."""
+
+    def __init__(self, tree: PyTree) -> None:
+        leaves, self._structure = jax.tree.flatten(tree)
+        self._shapes = [leaf.shape[:-1] for leaf in leaves]
+        self._sizes = [math.prod(shape) for shape in self._shapes]
+
+    def pack(self, tree: PyTree) -> jax.Array:
+        """`(size, lanes)`."""
+        leaves = jax.tree.leaves(tree)
+        lanes = leaves[0].shape[-1]
+        return jnp.concatenate([leaf.reshape(size, lanes) for leaf, size in zip(leaves, self._sizes, strict=True)])
+
+    def unpack(self, packed: jax.Array) -> PyTree:
+        """The pytree again."""
+        leaves, at = [], 0
+        for shape, size in zip(self._shapes, self._sizes, strict=True):
+            leaves.append(packed[at : at + size].reshape(*shape, packed.shape[-1]))
+            at += size
+        return jax.tree.unflatten(self._structure, leaves)
+
+
 def project_queue(
     system: System, seeds: PyTree, tasks: PyTree, shared: PyTree, count: jax.Array, lanes: int, settings: Settings
 ) -> Projection:
@@ -273,47 +297,55 @@ def project_queue(
 
     `seeds` and `tasks` have the tasks on their last axis, `(..., N)`; `shared` is the same for all. Only the first `count`
     (traced) tasks run. The outcome has N entries; those from `count` on are infeasible and meaningless.
+
+    A finished lane is copied out and refilled by slices: XLA's CPU gather and scatter go element by element and would cost
+    more than the iterations.
     """
-    total = jax.tree.leaves(seeds)[0].shape[-1]
-
-    def take(tree: PyTree, index: jax.Array) -> PyTree:
-        return jax.tree.map(lambda a: jnp.take(a, index, axis=-1, mode="clip"), tree)
-
+    points, packing = _Packing(seeds), _Packing(tasks)
+    seed_rows, task_rows = points.pack(seeds).T, packing.pack(tasks).T  # (N, size): a task is one run of memory
+    total, size = seed_rows.shape
+    count = jnp.asarray(count, jnp.int32)
     first = jnp.arange(lanes, dtype=jnp.int32)
-    data = (take(tasks, first), shared)
-    blank = init(system, take(seeds, first), data, settings)
-    results = Projection(
-        seeds, jnp.zeros((total,), bool), jnp.full((total,), jnp.inf, blank.violation.dtype), jnp.zeros((total,), jnp.int32)
-    )
-    Carry = tuple[State, PyTree, jax.Array, jax.Array, Projection]
+    start_x, start_tasks = seed_rows[:lanes].T, task_rows[:lanes].T
+    blank = init(system, points.unpack(start_x), (packing.unpack(start_tasks), shared), settings)
+    # Per task: the point, the violation, the iterations.
+    results = jnp.concatenate([seed_rows, jnp.full((total, 1), jnp.inf), jnp.zeros((total, 1))], axis=1)
+    Carry = tuple[State, jax.Array, jax.Array, jax.Array, jax.Array]
 
     def busy(carry: Carry) -> jax.Array:
         return jnp.any(carry[2] < count)
 
     def body(carry: Carry) -> Carry:
         state, lane_tasks, ids, following, results = carry
+        data = (packing.unpack(lane_tasks), shared)
         checked = state.residual
-        state = lax.fori_loop(
-            0, settings.check_period, lambda _, s: step(system, s, (lane_tasks, shared), settings), state
-        )
+        state = lax.fori_loop(0, settings.check_period, lambda _, s: step(system, s, data, settings), state)
         state = state._replace(checked=checked)
         done = finished(state, settings) & (ids < count)
-        where = jnp.where(done, ids, total)
-        outcome = _outcome(state, settings)
-        results = jax.tree.map(lambda all_, new: all_.at[..., where].set(new, mode="drop"), results, outcome)
-        ids = jnp.where(done, following + jnp.cumsum(done, dtype=jnp.int32) - 1, ids)
-        following = following + jnp.sum(done, dtype=jnp.int32)
-        fresh_x, fresh_tasks = take(seeds, ids), take(tasks, ids)
-        choose = lambda new, old: jnp.where(done, new, old)  # noqa: E731
-        state = State(
-            x=jax.tree.map(choose, fresh_x, state.x),
-            **{
-                name: jnp.where(done, getattr(blank, name), getattr(state, name))
-                for name in State._fields
-                if name != "x"
-            },
+        (leaving,) = jnp.nonzero(done, size=lanes, fill_value=0)
+        outcome = jnp.concatenate(
+            [points.pack(state.x), state.violation[None], state.iteration[None].astype(state.violation.dtype)]
         )
-        return state, jax.tree.map(choose, fresh_tasks, lane_tasks), ids, following, results
 
-    carry = (blank, data[0], first, jnp.asarray(lanes, jnp.int32), results)
-    return lax.while_loop(busy, body, carry)[4]
+        def exchange(i: jax.Array, held: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            x, lane_tasks, ids, results = held
+            lane, task = leaving[i], following + i
+            column = lax.dynamic_slice_in_dim(outcome, lane, 1, axis=1)
+            results = lax.dynamic_update_slice_in_dim(results, column.T, ids[lane], axis=0)
+            seed = lax.dynamic_slice_in_dim(seed_rows, jnp.minimum(task, total - 1), 1, axis=0)
+            task_row = lax.dynamic_slice_in_dim(task_rows, jnp.minimum(task, total - 1), 1, axis=0)
+            x = lax.dynamic_update_slice_in_dim(x, seed.T, lane, axis=1)
+            lane_tasks = lax.dynamic_update_slice_in_dim(lane_tasks, task_row.T, lane, axis=1)
+            return x, lane_tasks, lax.dynamic_update_index_in_dim(ids, task, lane, 0), results
+
+        moved = jnp.sum(done, dtype=jnp.int32)
+        x, lane_tasks, ids, results = lax.fori_loop(0, moved, exchange, (outcome[:size], lane_tasks, ids, results))
+        fresh = {n: jnp.where(done, getattr(blank, n), getattr(state, n)) for n in State._fields if n != "x"}
+        return State(x=points.unpack(x), **fresh), lane_tasks, ids, following + moved, results
+
+    carry = (blank, start_tasks, first, jnp.asarray(lanes, jnp.int32), results)
+    results = lax.while_loop(busy, body, carry)[4]
+    violation = results[:, size]
+    return Projection(
+        points.unpack(results[:, :size].T), violation <= settings.tolerance, violation, results[:, size + 1].astype(jnp.int32)
+    )

@@ -159,6 +159,23 @@ class ChainReader:
         return self._data
 
 
+def tool_poses_on_host(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tools in the root frame in numpy and the precision of the input: q `(lanes, n)` -> `(lanes, 3, 3)`, `(lanes, 3)`."""
+    lanes, joints = q.shape[0], chain.offset.shape[0]
+    rotation, position = np.tile(np.eye(3), (lanes, 1, 1)), np.zeros((lanes, 3))
+    move = q[:, :joints] - chain.reference
+    for i in range(joints):
+        position = position + rotation @ chain.offset[i]
+        rotation = rotation @ chain.rotation[i]
+        c, s = np.cos(move[:, i] * chain.hinge[i]), np.sin(move[:, i] * chain.hinge[i])
+        position = position + rotation[:, :, 2] * (move[:, i] * chain.slide[i])[:, None]
+        x, y = rotation[:, :, 0] * c[:, None], rotation[:, :, 1] * c[:, None]
+        rotation = np.stack(
+            [x + rotation[:, :, 1] * s[:, None], y - rotation[:, :, 0] * s[:, None], rotation[:, :, 2]], axis=2
+        )
+    return rotation @ chain.tool_rotation, position + rotation @ chain.tool_offset
+
+
 # ------------------------------------------------------------------ device: evaluating them
 
 
@@ -230,10 +247,14 @@ def tool_jacobian(chain: Chain, frames: JointFrames, tool: Pose) -> jax.Array:
 def padded(chain: Chain, joints: int) -> Chain:
     """The same chain with joints that do not move appended, so that chains of different lengths can be stacked."""
     more = joints - chain.offset.shape[0]
+    if not more:
+        return chain
+    module = np if isinstance(chain.rotation, np.ndarray) else jnp
+    still = (np.tile(np.eye(3, dtype=np.float32), (more, 1, 1)), *(np.zeros(s, np.float32) for s in ((more, 3), more)))
     return chain._replace(
-        rotation=np.concatenate([chain.rotation, np.tile(np.eye(3), (more, 1, 1))]),
-        offset=np.concatenate([chain.offset, np.zeros((more, 3))]),
-        hinge=np.concatenate([chain.hinge, np.zeros(more)]),
-        slide=np.concatenate([chain.slide, np.zeros(more)]),
-        reference=np.concatenate([chain.reference, np.zeros(more)]),
+        rotation=module.concatenate([chain.rotation, still[0]]),
+        offset=module.concatenate([chain.offset, still[1]]),
+        hinge=module.concatenate([chain.hinge, still[2]]),
+        slide=module.concatenate([chain.slide, still[2]]),
+        reference=module.concatenate([chain.reference, still[2]]),
     )

@@ -22,10 +22,10 @@ from jax import lax
 from cgs_jax import augmented_lagrangian as al
 from cgs_jax.collisions import Body, ClearanceData, place_object, place_robot, smallest_distance
 from cgs_jax.constraints import PoseRows, Term, row_data
-from cgs_jax.kinematics import Chain, joint_frames, padded, tool_pose
+from cgs_jax.kinematics import Chain, joint_frames, padded, tool_pose, tool_poses_on_host
 from cgs_jax.plans import Layout, Plan, PlanSystem, Shared, make_plan
 from cgs_jax.poses import Array, Pose, compose, from_vector, inverse, to_vector
-from cgs_jax.problems import Params, Problem
+from cgs_jax.problems import Params, Problem, pose_vector
 from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, pose_seed, uniforms
 from cgs_jax.transitions import Transition
 
@@ -97,6 +97,7 @@ def propose(
     random stream of a task is a function of `key` and `first_task + position`.
     """
     tasks = given.shape[0]
+    numbers = jax.tree.map(jnp.asarray, numbers)
     numbers_of = jnp.asarray(first_task, jnp.uint32) + jnp.arange(tasks, dtype=jnp.uint32)
     vectors = jnp.transpose(jnp.asarray(given), (2, 1, 0))  # (7, given, tasks)
     configurations = tuple(jnp.asarray(q).T for q in given_configurations)
@@ -123,7 +124,7 @@ def propose(
     def judge(part: PyTree) -> tuple[jax.Array, jax.Array]:
         point, data = part
         violation, poses = system.violations(point, (data, shared))
-        return violation, to_vector(Pose(jnp.moveaxis(poses.rotation, 0, 2), jnp.moveaxis(poses.position, 0, 1)))
+        return violation, to_vector(poses)
 
     blank = _blank(judge, tasks, CHUNK, (x, task_data))
     violation, poses = _chunked(judge, count, tasks, CHUNK, (x, task_data), blank)
@@ -183,6 +184,7 @@ def clearance(
     `poses` is `(tasks, poses, 7)`, `configurations` `(tasks, dof)` each; `count` (traced) of the tasks are in use.
     """
     tasks = poses.shape[0]
+    numbers = jax.tree.map(jnp.asarray, numbers)
 
     def pose_of(factors: tuple[Factor, ...], given: Array, q: tuple[Array, ...]) -> Pose | None:
         result: Pose | None = None
@@ -415,20 +417,19 @@ def gather_given(operator: Operator, params: Params, values: Mapping[str, Array]
             columns.append(values[term.name])
         elif term.kind == "constant":
             columns.append(module.broadcast_to(params.constants[term.name], (tasks, 7)))
-        elif term.variable is None or not params.chains[term.name].offset.shape[0]:
-            columns.append(module.broadcast_to(_tool_vector(params.chains[term.name], None, module), (tasks, 7)))
         else:
-            columns.append(_tool_vector(params.chains[term.name], values[term.variable], module))
+            assert term.variable is not None
+            columns.append(_tool_vector(params.chains[term.name], values[term.variable]))
     columns += [module.broadcast_to(identity, (tasks, 7))] * (operator.plan.layout.given - len(columns))
     return module.stack(columns, axis=1)
 
 
-def _tool_vector(chain: Chain, q: Array | None, module: Any) -> Array:
-    """Tool poses `(lanes, 7)` of a chain at given configurations `(lanes, dof)`; None for a chain without joints."""
-    joints = chain.offset.shape[0]
-    at = jnp.zeros((0, 1)) if q is None else jnp.asarray(q).T[:joints]
-    vector = to_vector(tool_pose(chain, joint_frames(chain, at))).T
-    return module.asarray(vector)
+def _tool_vector(chain: Chain, q: Array) -> Array:
+    """Tool poses `(lanes, 7)` of a chain at given configurations `(lanes, dof)`."""
+    if isinstance(q, np.ndarray):
+        rotation, position = tool_poses_on_host(chain, q)
+        return np.stack([pose_vector(r, x) for r, x in zip(rotation, position, strict=True)]).astype(np.float32)
+    return to_vector(tool_pose(chain, joint_frames(chain, q.T[: chain.offset.shape[0]]))).T
 
 
 @functools.lru_cache(maxsize=None)

@@ -122,8 +122,9 @@ class Places(NamedTuple):
     word: Array  # (places,) int32
     position: Array  # (places,) int32
     source: Array  # (places,) int32 tool or free pose
-    block: Array  # (places,) int32 configuration or free pose; -1 for an unused entry
+    block: Array  # (places,) int32 configuration or free pose
     inverted: Array  # (places,) bool
+    count: Array  # () int32 entries in use
 
 
 class Code(NamedTuple):
@@ -414,9 +415,10 @@ def _place_arrays(places: list[_Place], atoms: Mapping[Term, int], first: int, r
     for place in places:
         plain = Term(place.term.kind, place.term.name, place.term.variable)
         rows.append((place.word, place.position, atoms[plain] - first, place.block, place.term.inverted))
-    rows += [(0, 0, 0, -1, False)] * (room - len(rows))
+    rows += [(0, 0, 0, 0, False)] * (room - len(rows))
     columns = np.array(rows, np.int32).reshape(room, 5).T
-    return Places(columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool))
+    count = np.asarray(len(places), np.int32)
+    return Places(columns[0], columns[1], columns[2], columns[3], columns[4].astype(bool), count)
 
 
 def _words(products: list[Product], atoms: Mapping[Term, int], room: int, length: int) -> Words:
@@ -456,32 +458,41 @@ class Point(NamedTuple):
     free: Pose  # (free, 3, 3, lanes), (free, 3, lanes)
 
 
-def _pick(array: jax.Array, indices: jax.Array) -> jax.Array:
-    """Rows of the first axis, as dynamic slices: XLA's CPU gather goes element by element."""
-    return jnp.stack([lax.dynamic_index_in_dim(array, indices[i], 0, keepdims=False) for i in range(indices.shape[0])])
+class Prefixes(NamedTuple):
+    """Products of the first l factors of each word, words beside lanes: entry l of `(length + 1, 3, 3, words, lanes)`."""
+
+    rotation: jax.Array
+    position: jax.Array  # (length + 1, 3, words, lanes)
+    whole: Pose  # (3, 3, words, lanes), (3, words, lanes) the words themselves
 
 
-def multiply_words(words: Words, atoms: Pose) -> Pose:
-    """Prefix products of all words, `(length + 1, words, 3, 3, lanes)` and `(length + 1, words, 3, lanes)`.
+def _pick(array: jax.Array, indices: jax.Array, axis: int) -> jax.Array:
+    """Entries of the first axis, stacked on `axis`, by dynamic slices: XLA's CPU gather goes element by element."""
+    parts = [lax.dynamic_index_in_dim(array, indices[i], 0, keepdims=False) for i in range(indices.shape[0])]
+    return jnp.stack(parts, axis=axis)
 
-    `atoms` is `(atoms, 3, 3, lanes)`, `(atoms, 3, lanes)`. Entry l is the product of the first l factors; entries beyond the
-    longest word are zero, those beyond a shorter word repeat its product.
+
+def multiply_words(words: Words, atoms: Pose) -> Prefixes:
+    """Prefix products of all words; `atoms` is `(atoms, 3, 3, lanes)`, `(atoms, 3, lanes)`.
+
+    Entries beyond the longest word are undefined, those beyond a shorter word repeat its product.
     """
     count, length = words.atom.shape
     lanes = atoms.position.shape[-1]
     dtype = atoms.position.dtype
-    rotation = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[None, ..., None], (count, 3, 3, lanes))
-    position = jnp.zeros((count, 3, lanes), dtype)
+    rotation = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None, None], (3, 3, count, lanes))
+    position = jnp.zeros((3, count, lanes), dtype)
     rotations = jnp.zeros((length + 1, *rotation.shape), dtype).at[0].set(rotation)
     positions = jnp.zeros((length + 1, *position.shape), dtype)
 
     def body(i: jax.Array, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rotation, position, rotations, positions = state
-        index = words.atom[:, i]
-        flips = words.inverted[:, i]
-        rotation, position = times(
-            Pose(rotation, position), Pose(_pick(atoms.rotation, index), _pick(atoms.position, index)), flips
-        )
+        index, flips = words.atom[:, i], words.inverted[:, i][:, None]
+        turn, move = _pick(atoms.rotation, index, 2), _pick(atoms.position, index, 1)
+        turn = jnp.where(flips, transpose(turn), turn)
+        move = jnp.where(flips, -matvec(turn, move), move)
+        position = position + matvec(rotation, move)
+        rotation = matmul(rotation, turn)
         return (
             rotation,
             position,
@@ -489,18 +500,8 @@ def multiply_words(words: Words, atoms: Pose) -> Pose:
             lax.dynamic_update_index_in_dim(positions, position, i + 1, 0),
         )
 
-    _, _, rotations, positions = lax.fori_loop(0, words.length, body, (rotation, position, rotations, positions))
-    return Pose(rotations, positions)
-
-
-def times(product: Pose, factor: Pose, flips: jax.Array) -> Pose:
-    """Products with the factors or, where `flips` `(words,)`, with their inverses; `(words, 3, 3, *lanes)` layout."""
-    left, move = jnp.moveaxis(product.rotation, 0, 2), jnp.moveaxis(product.position, 0, 1)
-    right, shift = jnp.moveaxis(factor.rotation, 0, 2), jnp.moveaxis(factor.position, 0, 1)
-    flips = flips.reshape(flips.shape + (1,) * (shift.ndim - 2))
-    right = jnp.where(flips, transpose(right), right)
-    shift = jnp.where(flips, -matvec(right, shift), shift)
-    return Pose(jnp.moveaxis(matmul(left, right), 2, 0), jnp.moveaxis(move + matvec(left, shift), 1, 0))
+    state = lax.fori_loop(0, words.length, body, (rotation, position, rotations, positions))
+    return Prefixes(state[2], state[3], Pose(state[0], state[1]))
 
 
 def tools_at(layout: Layout, chains: Chain, configurations: Array) -> tuple[Pose, jax.Array]:
@@ -528,31 +529,38 @@ def all_atoms(given: Pose, tools: Pose, free: Pose) -> Pose:
     )
 
 
-def _carried(places: Places, tangents: jax.Array, sources: Pose, prefixes: Pose, blocks: int) -> jax.Array:
-    """Derivatives of the words by one kind of atom: `(words, blocks, 6, n, lanes)`.
+def _carried(places: Places, tangents: jax.Array, sources: Array, prefixes: Prefixes, blocks: int) -> jax.Array:
+    """Derivatives of the words by one kind of atom: `(6, n, words * blocks, lanes)`, word by word.
 
-    `tangents` `(sources, 6, n, lanes)` moves the atom itself. With the product (R, p) before the atom and the word's origin e,
-    an atom (S, s; v, w) moves the word by `R v + (R w) x (e - p')`, where p' is the product's origin after the atom, and turns
-    it by `R w`. An inverse moves by `S^T (w x s - v)` and turns by `-S^T w`; `R S^T` is the rotation after it.
+    `tangents` `(sources, 6, n, lanes)` moves the atoms themselves, whose origins are `sources` `(sources, 3, lanes)`. With the
+    product (R, p) before an atom (S, s; v, w), p' after it and the word's origin e, the atom moves the word by
+    `R v + (R w) x (e - p')` and turns it by `R w`. An inverse moves by `S^T (w x s - v)` and turns by `-S^T w`; `R S^T` is the
+    rotation after it.
     """
-    words = prefixes.rotation.shape[1]
-    result = 0.0
-    for i in range(places.word.shape[0]):
+    words, lanes = prefixes.position.shape[2:]
+    n = tangents.shape[2]
+
+    def add(i: jax.Array, total: jax.Array) -> jax.Array:
         word, position, flips = places.word[i], places.position[i], places.inverted[i]
-        before = prefixes.rotation[position, word]
-        after, origin = prefixes.rotation[position + 1, word], prefixes.position[position + 1, word]
-        end = prefixes.position[-1, word]
+
+        def at(array: jax.Array, entry: jax.Array) -> jax.Array:
+            row = lax.dynamic_index_in_dim(array, entry, 0, keepdims=False)
+            return lax.dynamic_index_in_dim(row, word, row.ndim - 2, keepdims=False)
+
+        carrier = jnp.where(flips, -at(prefixes.rotation, position + 1), at(prefixes.rotation, position))[:, :, None]
+        end = lax.dynamic_index_in_dim(prefixes.whole.position, word, 1, keepdims=False)
+        arm = (end - at(prefixes.position, position + 1))[:, None]
         tangent = lax.dynamic_index_in_dim(tangents, places.source[i], 0, keepdims=False)
-        place = lax.dynamic_index_in_dim(sources.position, places.source[i], 0, keepdims=False)
+        place = lax.dynamic_index_in_dim(sources, places.source[i], 0, keepdims=False)[:, None]
         turn = tangent[3:]
-        move = tangent[:3] - jnp.where(flips, 1.0, 0.0) * cross(turn, place[:, None])
-        carrier = jnp.where(flips, -after, before)[:, :, None]
+        move = tangent[:3] - jnp.where(flips, 1.0, 0.0) * cross(turn, place)
         turned = matvec(carrier, turn)
-        moved = matvec(carrier, move) + cross(turned, (end - origin)[:, None])
-        hit = (jnp.arange(words)[:, None] == word) & (jnp.arange(blocks)[None] == places.block[i])
-        part = jnp.concatenate([moved, turned])
-        result = result + jnp.where(hit[:, :, None, None, None], part, 0.0)
-    return result
+        part = jnp.concatenate([matvec(carrier, move) + cross(turned, arm), turned])[:, :, None]
+        slot = word * blocks + places.block[i]
+        return lax.dynamic_update_slice_in_dim(total, lax.dynamic_slice_in_dim(total, slot, 1, 2) + part, slot, 2)
+
+    start = jnp.zeros((6, n, words * blocks, lanes), tangents.dtype)
+    return lax.fori_loop(0, places.count, add, start)
 
 
 class PlanSystem:
@@ -561,16 +569,11 @@ class PlanSystem:
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
 
-    def _products(self, x: Point, tasks: Tasks, shared: Shared) -> tuple[Pose, Pose, jax.Array, Pose]:
-        """Atoms; prefix products with the whole words as last entry; tool Jacobians; tools."""
+    def _products(self, x: Point, tasks: Tasks, shared: Shared) -> tuple[Pose, Prefixes, jax.Array, Pose]:
+        """Atoms, prefix products, tool Jacobians and tools."""
         tools, jacobians = tools_at(self.layout, shared.chains, x.configurations)
         atoms = all_atoms(tasks.given, tools, x.free)
-        prefixes = multiply_words(shared.code.words, atoms)
-        last = shared.code.words.length
-        prefixes = Pose(
-            prefixes.rotation.at[-1].set(prefixes.rotation[last]), prefixes.position.at[-1].set(prefixes.position[last])
-        )
-        return atoms, prefixes, jacobians, tools
+        return atoms, multiply_words(shared.code.words, atoms), jacobians, tools
 
     def rows(self, x: Point, data: tuple[Tasks, Shared]) -> Rows:
         """All rows with their Jacobian; violated bounds are pulled inside by each lane's own slack."""
@@ -580,16 +583,14 @@ class PlanSystem:
         _, prefixes, jacobians, tools = self._products(x, tasks, shared)
         parts = []
         if layout.configurations:
-            tangent = _carried(code.tools, jacobians, tools, prefixes, layout.configurations)
-            tangent = jnp.moveaxis(tangent, 1, 2).reshape(layout.words, 6, -1, lanes)
-            parts.append(tangent)
+            tangent = _carried(code.tools, jacobians, tools.position, prefixes, layout.configurations)
+            parts.append(_by_word(tangent, layout.words, layout.configurations))
         if layout.free:
             identity = jnp.broadcast_to(jnp.eye(6)[None, ..., None], (layout.free, 6, 6, lanes))
-            tangent = _carried(code.free, identity, x.free, prefixes, layout.free)
-            parts.append(jnp.moveaxis(tangent, 1, 2).reshape(layout.words, 6, -1, lanes))
-        tangents = jnp.concatenate(parts, axis=2)  # (words, 6, n, lanes)
-        pose = Pose(jnp.moveaxis(prefixes.rotation[-1], 0, 2), jnp.moveaxis(prefixes.position[-1], 0, 1))
-        measured = pose_rows(pose, _with_lane(shared.rows))
+            tangent = _carried(code.free, identity, x.free.position, prefixes, layout.free)
+            parts.append(_by_word(tangent, layout.words, layout.free))
+        tangents = jnp.concatenate(parts, axis=2) if len(parts) > 1 else parts[0]  # (words, 6, n, lanes)
+        measured = pose_rows(prefixes.whole, _with_lane(shared.rows))
         value = jnp.moveaxis(measured.value, 1, 0).reshape(6 * layout.words, lanes)
         jacobian = jnp.concatenate([tangents[:, :3], _turn_rows(measured.turn, tangents[:, 3:])], axis=1)
         jacobian = jacobian.reshape(6 * layout.words, layout.unknowns, lanes)
@@ -608,13 +609,13 @@ class PlanSystem:
         return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
 
     def _arguments(
-        self, slot: FunctionSlot, x: Point, tasks: Tasks, prefixes: Pose, tangents: jax.Array | None
+        self, slot: FunctionSlot, x: Point, tasks: Tasks, prefixes: Prefixes, tangents: jax.Array | None
     ) -> dict[str, FunctionArgument]:
         layout = self.layout
         arguments = {}
         for name, (kind, at) in zip(slot.function.scope, slot.arguments, strict=True):
             if kind == "word":
-                pose = Pose(prefixes.rotation[-1, at], prefixes.position[-1, at])
+                pose = Pose(prefixes.whole.rotation[:, :, at], prefixes.whole.position[:, at])
                 arguments[name] = FunctionArgument(pose, None if tangents is None else tangents[at])
             elif at >= layout.configurations:
                 arguments[name] = FunctionArgument(tasks.configurations[at - layout.configurations], None)
@@ -646,13 +647,12 @@ class PlanSystem:
         return Point(q, Pose(jnp.stack([p.rotation for p in poses]), jnp.stack([p.position for p in poses])))
 
     def violations(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, Pose]:
-        """Largest violation per constraint `(constraints, lanes)`, m or rad, and the new poses `(outputs, 3, 3, lanes)`."""
+        """Largest violation per constraint `(constraints, lanes)`, m or rad, and the new poses `(3, 3, outputs, lanes)`."""
         tasks, shared = data
         layout = self.layout
         lanes = tasks.slack.shape[-1]
         atoms, prefixes, _, _ = self._products(x, tasks, shared)
-        pose = Pose(jnp.moveaxis(prefixes.rotation[-1], 0, 2), jnp.moveaxis(prefixes.position[-1], 0, 1))
-        value = pose_rows(pose, _with_lane(shared.rows)).value
+        value = pose_rows(prefixes.whole, _with_lane(shared.rows)).value
         low, high = (jnp.asarray(bound)[..., None] for bound in (shared.rows.low, shared.rows.high))
         worst = jnp.max(jnp.abs(value - jnp.clip(value, low, high)), axis=0)  # (words, lanes)
         worst = jnp.where(jnp.isfinite(worst), worst, jnp.inf)
@@ -662,13 +662,17 @@ class PlanSystem:
             gap = jnp.abs(more) if slot.function.kind == "equality" else jnp.maximum(more, 0.0)
             gap = jnp.where(jnp.isfinite(gap), gap, jnp.inf)
             result = result.at[slot.constraint].max(jnp.broadcast_to(jnp.max(gap, axis=0), (lanes,)))
-        outputs = multiply_words(shared.code.outputs, atoms)
-        last = shared.code.outputs.length
-        return result[: layout.constraints], Pose(outputs.rotation[last], outputs.position[last])
+        return result[: layout.constraints], multiply_words(shared.code.outputs, atoms).whole
 
 
 def _with_lane(rows: RowData) -> RowData:
     return jax.tree.map(lambda a: jnp.asarray(a)[..., None], rows)
+
+
+def _by_word(tangent: jax.Array, words: int, blocks: int) -> jax.Array:
+    """`(6, n, words * blocks, lanes)` -> `(words, 6, blocks * n, lanes)`."""
+    parts = [[tangent[:, :, w * blocks + b] for b in range(blocks)] for w in range(words)]
+    return jnp.stack([jnp.concatenate(row, axis=1) if blocks > 1 else row[0] for row in parts])
 
 
 def _turn_rows(turn: jax.Array, angular: jax.Array) -> jax.Array:

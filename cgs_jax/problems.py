@@ -51,6 +51,13 @@ class Params(NamedTuple):
     tables: dict[str, RobotTable]  # "robot" or "robot, hanging"
 
 
+class Exact(NamedTuple):
+    """Constants and chains in double precision, for the keyframes."""
+
+    constants: dict[str, np.ndarray]  # name -> (7,)
+    chains: dict[str, Chain]
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A constraint graph over a scene, and what its constraints compute."""
@@ -68,6 +75,7 @@ class Problem:
     base_poses: Mapping[tuple[str, str], Product]
     """(floating robot, switch) to the pose of its base as a product."""
     params: Params
+    exact: Exact
     operators: dict = field(default_factory=dict, repr=False)
     """Operators by conditional problem, made on demand (`cgs_jax.operators.operator_of`)."""
 
@@ -129,7 +137,11 @@ class _Builder:
 
     def chain(self, robot: str, frame: str, variable: str) -> Term:
         name = f"{robot}/{frame}"
-        self.chains[name] = self.readers[robot].chain(frame)
+        chain = self.readers[robot].chain(frame)
+        if not chain.hinge.size:
+            # A site on the base does not move with the joints.
+            return self.constant(name, pose_vector(chain.tool_rotation, chain.tool_offset))
+        self.chains[name] = chain
         return Term("chain", name, variable)
 
     def hanging(self, robot: Robot, switch: str) -> Hold | None:
@@ -280,6 +292,7 @@ class _Builder:
             object_poses=object_poses,
             base_poses=base_poses,
             params=_single_precision(params),
+            exact=Exact(self.constants, self.chains),
         )
 
     def limits(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -441,9 +454,14 @@ def _relative_pose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """T_a_b (7,) from two world poses."""
     rotation_a, position_a = _matrix(a)
     rotation_b, position_b = _matrix(b)
+    return pose_vector(rotation_a.T @ rotation_b, rotation_a.T @ (position_b - position_a))
+
+
+def pose_vector(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """`[x y z qw qx qy qz]` of a rotation matrix and a position."""
     quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, (rotation_a.T @ rotation_b).ravel())
-    return np.concatenate([rotation_a.T @ (position_b - position_a), quat])
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
+    return np.concatenate([position, quat])
 
 
 def _single_precision(params: Params) -> Params:

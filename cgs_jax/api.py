@@ -1,0 +1,231 @@
+"""What a caller uses: sample a problem, or take its operators as pure functions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cgs_jax import augmented_lagrangian as al
+from cgs_jax.errors import InputError
+from cgs_jax.operators import PENETRATION, clearance, gather_given, gather_poses, operator_of, propose
+from cgs_jax.poses import Array
+from cgs_jax.problems import Params, Problem
+from cgs_jax.record import Recorder, sample_set
+from cgs_jax.sampler import Event, Found, Sampler, SamplerSettings
+from cgs_jax.samples import SampleSet
+from cgs_jax.transitions import Transition
+from cgs_jax.uct import Chooser, Fixed, Random, Tree
+
+WARM_VISITS = 8.0
+"""Equivalent visits (batches) that statistics of earlier runs count for."""
+
+MAX_LANES = 64
+"""Lanes of the pure operators' solver."""
+
+
+def make_chooser(
+    problem: Problem,
+    method: str = "tree",
+    seed: int = 0,
+    prior: Sequence[Mapping[str, Any]] = (),
+    c_uct: float | None = None,
+    reward: str = "rate",
+    pools: bool = True,
+) -> Chooser:
+    """The chooser of a method.
+
+    method: "tree" (UCT), "tree-warm" (UCT that starts from `prior`), "rand", the name of a sequence of the task file, or a
+    sequence as text. prior: trees of earlier runs (`tree.json`). Raises InputError for anything else, naming what there is.
+    """
+    transitions = problem.transitions
+    sequences = problem.scene.task.sequences
+    if method == "tree-warm" and not prior:
+        raise InputError("method 'tree-warm' needs statistics of earlier runs: give at least one tree (--warm-start FILE)")
+    if method in ("tree", "tree-warm"):
+        options: dict[str, Any] = {} if c_uct is None else {"c_uct": c_uct}
+        tree = Tree(transitions, reward=reward, retain=pools, **options)
+        if prior:
+            tree.warm_start(list(prior), WARM_VISITS)
+        return tree
+    if method == "rand":
+        return Random(transitions, seed, retain=pools)
+    if method in sequences:
+        return Fixed(transitions, transitions.parse(sequences[method]), retain=pools)
+    if not any(mark in method for mark in ";,()") and method not in [v.name for v in problem.graph.variables]:
+        known = ", ".join(["tree", "tree-warm", "rand", *sequences])
+        raise InputError(f"unknown method '{method}', expected one of: {known}; or a sequence such as \"t_b; (q_a1,t_a); ...\"")
+    return Fixed(transitions, transitions.parse(method), retain=pools)
+
+
+def load_tree(path: str | Path) -> dict[str, Any]:
+    """A tree saved by an earlier run (`tree.json`). Raises InputError when it cannot be read."""
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read tree {path}: {error}") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path} is no saved tree, expected a tree.json of an earlier run")
+    return data
+
+
+def check_budget(time_budget: float, num_samples: int | None, batch_size: int) -> None:
+    """Raises InputError for budgets and sizes that make no sense."""
+    if not time_budget > 0:
+        raise InputError(f"time budget is {time_budget} s, expected more than 0")
+    if num_samples is not None and num_samples < 1:
+        raise InputError(f"number of samples is {num_samples}, expected at least 1")
+    if batch_size < 1:
+        raise InputError(f"batch size is {batch_size}, expected at least 1")
+
+
+class Run:
+    """One run with its record; iterate `events` to drive it."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        method: str = "tree",
+        seed: int = 0,
+        settings: SamplerSettings | None = None,
+        prior: Sequence[Mapping[str, Any]] = (),
+        **chooser_options: Any,
+    ) -> None:
+        settings = settings or SamplerSettings()
+        chooser = make_chooser(problem, method, seed, prior, pools=settings.pools, **chooser_options)
+        self.sampler = Sampler(problem, chooser, seed, settings)
+        self.record = Recorder(problem, chooser, method, seed, settings, self.sampler.auditor)
+
+    def events(self, time_budget: float, num_samples: int | None = None) -> Iterator[Event]:
+        """Drives the run; every event has been recorded when it is yielded."""
+        check_budget(time_budget, num_samples, self.sampler.settings.batch_size)
+        for event in self.sampler.events(time_budget, num_samples):
+            self.record.listen(event)
+            yield event
+
+    def stop(self) -> None:
+        """Ends the run after the batches in flight; may be called from a signal handler."""
+        self.sampler.stop()
+
+
+def sample(
+    problem: Problem,
+    time_budget: float = 10.0,
+    num_samples: int | None = None,
+    method: str = "tree",
+    seed: int = 0,
+    prior: Sequence[Mapping[str, Any]] = (),
+    settings: SamplerSettings | None = None,
+) -> SampleSet:
+    """Samples a problem for a time (s of sampling, from the moment the first operators are ready) or up to a number.
+
+    Every sample passed the double-precision audit. The result may be empty. Raises InputError for a wrong method or budget.
+    Paper, Algorithm 1.
+    """
+    run = Run(problem, method, seed, settings, prior)
+    for _ in run.events(time_budget, num_samples):
+        pass
+    return run.record.samples()
+
+
+def stream(
+    problem: Problem,
+    time_budget: float = 10.0,
+    num_samples: int | None = None,
+    method: str = "tree",
+    seed: int = 0,
+    prior: Sequence[Mapping[str, Any]] = (),
+    settings: SamplerSettings | None = None,
+) -> Iterator[SampleSet]:
+    """Like `sample`, but yields verified samples in batches as they come."""
+    run = Run(problem, method, seed, settings, prior)
+    names = run.sampler.auditor.constraints
+    for event in run.events(time_budget, num_samples):
+        if isinstance(event, Found) and len(event.qpos):
+            yield sample_set(problem, [event], run.record.meta(), names)
+
+
+# ------------------------------------------------------------------ pure functions
+
+PureOperator = Callable[..., tuple[dict[str, jax.Array], jax.Array]]
+
+
+def operator(
+    problem: Problem, given: Iterable[str], new: Iterable[str], settings: al.Settings | None = None
+) -> PureOperator:
+    """A conditional operator as a pure function `op(key, values, params, lanes=None) -> (new values, feasible)`.
+
+    values: `(lanes, dim)` of the given variables that the operator reads; `lanes` is needed only where it reads none.
+    params: `problem.params`, or other numbers of the same shapes. Returns `(lanes, dim)` per new variable and a mask: rows
+    within the solver's tolerance and clearance within `PENETRATION`. Composes with `jax.jit`, `jax.vmap` (over params or
+    keys) and `shard_map`. Raises InputError for unknown variables, or when given and new overlap.
+    """
+    transition = conditional(problem, given, new)
+    bound = operator_of(problem, transition)
+    settings = settings or al.Settings()
+
+    def apply(
+        key: jax.Array, values: Mapping[str, Array], params: Params, lanes: int | None = None
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        missing = [name for name in bound.condition if name not in values]
+        if missing:
+            raise InputError(f"operator for {', '.join(bound.new)} needs values of {', '.join(missing)}")
+        read = {name: jnp.asarray(values[name]) for name in bound.condition}
+        count = lanes if lanes is not None else next((len(value) for value in read.values()), None)
+        if count is None:
+            raise InputError(f"operator for {', '.join(bound.new)} reads no variable: say how many lanes")
+        arguments = gather_given(bound, params, read, count)
+        of_function = tuple(read[name] for name in bound.plan.given_configurations)
+        proposals = propose(
+            bound.plan.layout, settings, MAX_LANES, key, 0, count, arguments, of_function, bound.numbers(params)
+        )
+        found = bound.named(proposals)
+        feasible = proposals.feasible
+        everything = read | found
+        for clear in bound.clears:
+            poses = gather_poses(clear, params, everything, count)
+            q = tuple(everything[name] for name in clear.configurations)
+            feasible &= clearance(clear.layout, count, poses, q, clear.numbers(params)) >= -PENETRATION
+        return found, feasible
+
+    return apply
+
+
+def conditional(problem: Problem, given: Iterable[str], new: Iterable[str]) -> Transition:
+    """The transition that assigns `new` where `given` are assigned, whether or not pruning keeps it."""
+    graph = problem.graph
+    known = [variable.name for variable in graph.variables]
+    given, new = frozenset(given), frozenset(new)
+    for name in [*given, *new]:
+        if name not in known:
+            raise InputError(f"unknown variable '{name}', available: {', '.join(known)}")
+    if not new or given & new:
+        raise InputError(f"new variables must be some that are not given; given {sorted(given)}, new {sorted(new)}")
+    active = [c for c in graph.constraints if set(c.scope) <= given | new and set(c.scope) & new]
+    condition = frozenset(name for c in active for name in c.scope) & given
+    return Transition(given, graph.ordered(new), tuple(c.name for c in active), condition)
+
+
+def rollout(problem: Problem, sequence: str | Iterable, settings: al.Settings | None = None) -> Callable:
+    """A whole sequence as one pure function `draw(key, params, lanes) -> (values, feasible)`.
+
+    Lanes that failed stay masked; nothing is refilled. Raises InputError for a text that is no sequence of the graph.
+    """
+    path = problem.transitions.parse(sequence)
+    operators = [operator(problem, t.given, t.new, settings) for t in path]
+
+    def draw(key: jax.Array, params: Params, lanes: int) -> tuple[dict[str, jax.Array], jax.Array]:
+        values: dict[str, jax.Array] = {}
+        feasible = jnp.ones((lanes,), bool)
+        for i, apply in enumerate(operators):
+            found, ok = apply(jax.random.fold_in(key, i), values, params, lanes)
+            values |= found
+            feasible &= ok
+        return values, feasible
+
+    return draw
+

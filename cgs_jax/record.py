@@ -1,0 +1,282 @@
+"""The record of a run: listens to a sampler's events and turns them into samples, statistics and files."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cgs_jax.audit import Auditor
+from cgs_jax.problems import Problem
+from cgs_jax.sampler import Compiled, Event, Finished, Found, Ran, SamplerSettings, Started
+from cgs_jax.samples import SampleSet
+from cgs_jax.scene import attachments, goals, placements
+from cgs_jax.transitions import Transition
+from cgs_jax.uct import Chooser
+
+
+@dataclass
+class OperatorRecord:
+    """What one conditional problem did in a run."""
+
+    calls: int = 0
+    tasks: int = 0
+    proposed: int = 0
+    cleared: int = 0
+    iterations: int = 0
+    device_seconds: float = 0.0
+    first_tries: int = 0
+    first_successes: int = 0
+    second_tries: int = 0
+    second_successes: int = 0
+    failures: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of tasks that succeeded."""
+        return self.cleared / max(self.tasks, 1)
+
+    @property
+    def causes(self) -> tuple[float, float] | None:
+        """The two factors of the paper's Eq. 2: how often the condition is feasible, and the solver's success on those.
+
+        With f feasible and s solved of them, a first try succeeds with f s, a second one of a failed condition with
+        f (1 - s) s / (1 - f s). None without enough second tries to tell.
+        """
+        if self.second_tries < 30 or not self.first_successes:
+            return None
+        first = self.first_successes / self.first_tries
+        second = self.second_successes / self.second_tries
+        solved = min(max(1.0 - second * (1.0 - first) / first, first), 1.0)
+        return min(first / solved, 1.0), solved
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers."""
+        causes = self.causes
+        return {
+            "calls": self.calls,
+            "tasks": self.tasks,
+            "rows_solved": self.proposed,
+            "successes": self.cleared,
+            "success_rate": self.success_rate,
+            "iterations_per_task": self.iterations / max(self.tasks, 1),
+            "device_seconds": self.device_seconds,
+            "microseconds_per_task": 1e6 * self.device_seconds / max(self.tasks, 1),
+            "condition_feasible": None if causes is None else causes[0],
+            "solver_success_if_feasible": None if causes is None else causes[1],
+            "failures": dict(sorted(self.failures.items(), key=lambda item: -item[1])),
+        }
+
+
+class Recorder:
+    """Aggregates the events of one run."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        chooser: Chooser,
+        method: str,
+        seed: int,
+        settings: SamplerSettings,
+        auditor: Auditor,
+    ) -> None:
+        self.problem, self.chooser, self.method, self.seed = problem, chooser, method, seed
+        self.settings, self.tolerances, self._columns = settings, auditor.tolerances, auditor.constraints
+        self.operators: dict[str, OperatorRecord] = {}
+        self.startup_seconds = self.compile_seconds = self.device_seconds = 0.0
+        self.host_seconds = self.audit_seconds = self.elapsed = 0.0
+        self.programs: list[tuple[str, float]] = []
+        self.count = self.rejected = 0
+        self.reason: str | None = None
+        self._found: list[Found] = []
+
+    def listen(self, event: Event) -> None:
+        """Takes one event in."""
+        if isinstance(event, Compiled):
+            self.compile_seconds += event.seconds
+            self.programs.append((event.name, event.seconds))
+        elif isinstance(event, Started):
+            self.startup_seconds = event.startup_seconds
+        elif isinstance(event, Ran):
+            self._ran(event)
+        elif isinstance(event, Found):
+            self._found.append(event)
+            self.count += len(event.qpos)
+            self.rejected += event.rejected
+            self.audit_seconds += event.audit_seconds
+            self.elapsed = event.elapsed
+        elif isinstance(event, Finished):
+            self.reason, self.elapsed = event.reason, event.elapsed
+
+    def _ran(self, event: Ran) -> None:
+        record = self.operators.setdefault(operator_text(event.path[event.position]), OperatorRecord())
+        record.calls += 1
+        for name in (
+            "tasks",
+            "proposed",
+            "cleared",
+            "iterations",
+            "device_seconds",
+            "first_tries",
+            "first_successes",
+            "second_tries",
+            "second_successes",
+        ):
+            setattr(record, name, getattr(record, name) + getattr(event, name))
+        for name, times in event.failures.items():
+            record.failures[name] = record.failures.get(name, 0) + times
+        self.device_seconds += event.device_seconds
+        self.host_seconds += event.host_seconds
+
+    @property
+    def rate(self) -> float:
+        """Samples per second of sampling time so far."""
+        return self.count / self.elapsed if self.elapsed else 0.0
+
+    def best_sequences(self, count: int) -> list[tuple[str, float]]:
+        """Sequences with the highest predicted rates (samples per second of the whole machine), best first."""
+        # The chooser knows device seconds of single batches; several run side by side.
+        return [
+            (self.problem.transitions.format(path), rate * self.settings.workers)
+            for path, rate in self.chooser.best_sequences(count)
+        ]
+
+    def samples(self) -> SampleSet:
+        """The samples found so far."""
+        return sample_set(self.problem, self._found, self.meta(), self._columns)
+
+    def meta(self) -> dict[str, Any]:
+        """Description of the run, JSON-ready (`meta` of schema cgs_jax/1)."""
+        chooser: Any = self.chooser
+        price = getattr(chooser, "price", chooser.rate)
+        transitions = self.problem.transitions
+        return {
+            "scene": self.problem.name,
+            "instance": self.problem.scene.instance,
+            "seed": self.seed,
+            "method": self.method,
+            "tolerances": vars(self.tolerances),
+            "versions": {name: _version(name) for name in ("cgs-jax", "jax", "mujoco", "mujoco-mjx", "numpy")}
+            | {"python": platform.python_version()},
+            "startup_seconds": self.startup_seconds,
+            "elapsed": self.elapsed,
+            "wall_seconds": self.startup_seconds + self.elapsed,
+            "compile_seconds": self.compile_seconds,
+            "device_seconds": self.device_seconds,
+            "host_seconds": self.host_seconds,
+            "audit_seconds": self.audit_seconds,
+            "samples": self.count,
+            "rejected_by_audit": self.rejected,
+            "rate": self.rate,
+            "ended_by": self.reason,
+            # The paper's weight for costs in seconds: lambda = 1 / (c + 1), c the seconds per finished sample.
+            "lambda": price / (1.0 + price),
+            "c_uct": getattr(chooser, "c_uct", None),
+            "reward": getattr(chooser, "reward", None),
+            "batch_size": self.settings.batch_size,
+            "tries": self.settings.tries,
+            "pools": self.settings.pools,
+            "workers": self.settings.workers,
+            "deterministic": self.settings.deterministic,
+            "transitions": {"complete": transitions.complete_count, "pruned": transitions.pruned_count()},
+        }
+
+    def profile(self) -> dict[str, Any]:
+        """Where the time went: per operator, compilation, host, audit."""
+        total = self.settings.workers * self.elapsed
+        return {
+            "operators": {name: record.as_json() for name, record in self._by_time()},
+            "programs": [{"name": name, "seconds": seconds} for name, seconds in self.programs],
+            "shares_of_worker_time": {
+                "device": self.device_seconds / total if total else 0.0,
+                "host": self.host_seconds / total if total else 0.0,
+                "audit": self.audit_seconds / total if total else 0.0,
+            },
+        }
+
+    def _by_time(self) -> list[tuple[str, OperatorRecord]]:
+        return sorted(self.operators.items(), key=lambda item: -item[1].device_seconds)
+
+    def diagnosis(self) -> str:
+        """Which operator and constraint stopped the run, in one line; for runs without a sample."""
+        tried = [(name, record) for name, record in self.operators.items() if record.tasks]
+        if not tried:
+            return "no operator ran before the budget ended; give more time with --time-budget"
+        name, record = min(tried, key=lambda item: (item[1].success_rate, -item[1].tasks))
+        if not record.failures:
+            return f"operator {name} succeeded {record.cleared} of {record.tasks} times; give more time with --time-budget"
+        constraint, times = max(record.failures.items(), key=lambda item: item[1])
+        share = 100.0 * times / max(sum(record.failures.values()), 1)
+        return (
+            f"operator {name} succeeded {record.cleared} of {record.tasks} times; "
+            f"{constraint} stopped {share:.0f} % of its failures"
+        )
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Writes samples.npz (if there is a sample), tree.json and run.json into a folder; returns the folder."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.count:
+            self.samples().save(folder / "samples.npz")
+        chooser: Any = self.chooser
+        write_json(folder / "tree.json", chooser.as_json())
+        write_json(folder / "run.json", self.meta() | {"best_sequences": self.best_sequences(3)} | self.profile())
+        return folder
+
+
+def operator_text(transition: Transition) -> str:
+    """An operator by its conditional problem: new variables, then what they are conditioned on."""
+    new = ",".join(transition.new)
+    new = f"({new})" if len(transition.new) > 1 else new
+    return f"{new} | {','.join(sorted(transition.condition))}" if transition.condition else new
+
+
+def sample_set(problem: Problem, found: list[Found], meta: Mapping[str, Any], constraints: tuple[str, ...]) -> SampleSet:
+    """Samples of several events as one set."""
+    task, model = problem.scene.task, problem.scene.model
+    names = [variable.name for variable in problem.graph.variables]
+    kinds = {variable.name: variable.kind for variable in problem.graph.variables}
+    texts = tuple(dict.fromkeys(event.sequence for event in found))
+    empty = np.zeros((0, len(task.switches), model.nq))
+    values = {}
+    for name in names:
+        size = 7 if problem.dofs[name] is None else problem.dofs[name]
+        parts = [event.values[name] for event in found]
+        values[name] = np.concatenate([np.zeros((0, size)), *parts]).astype(np.float64)
+    return SampleSet(
+        mjcf=problem.scene.xml,
+        variables=values,
+        mode_switches=tuple(switch.name for switch in task.switches),
+        qpos=np.concatenate([empty, *(event.qpos for event in found)]),
+        attachments=attachments(task),
+        placements=placements(task),
+        goals=goals(task),
+        sequences=texts,
+        sequence=np.repeat([texts.index(e.sequence) for e in found], [len(e.qpos) for e in found]).astype(np.intp),
+        elapsed=np.repeat([e.elapsed for e in found], [len(e.qpos) for e in found]),
+        violation=np.concatenate([np.zeros((0, len(constraints))), *(event.violation for event in found)]),
+        constraints=constraints,
+        meta=meta,
+        kinds=kinds,
+    )
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Writes JSON so that the file is either whole or not there."""
+    temporary = path.with_name(path.name + f".{os.getpid()}.part")
+    temporary.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    temporary.replace(path)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
