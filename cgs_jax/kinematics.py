@@ -74,7 +74,7 @@ class ChainReader:
         for joint, kind in zip(joints, kinds, strict=True):
             if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
                 raise InputError(
-                    f"joint '{joint}' of robot '{name}' is a {kind.name[5:].lower()} joint; expected a hinge or a slide"
+                    f"joint '{joint}' of robot '{name}' is a {kind.name[6:].lower()} joint; expected a hinge or a slide"
                 )
         self._model = model
         self._hinge = np.array([kind == mujoco.mjtJoint.mjJNT_HINGE for kind in kinds], dtype=float)
@@ -193,6 +193,8 @@ def joint_frames(chain: Chain, q: Array) -> JointFrames:
     """
     n, lanes = q.shape[0], q.shape[1:]
     axes = len(lanes)
+    if not n:
+        return JointFrames(jnp.zeros((0, 3, 3, *lanes)), jnp.zeros((0, 3, *lanes)))
     move = jnp.asarray(q) - _with_lanes(chain.reference, 1, axes)
     angle = move * _with_lanes(chain.hinge, 1, axes)
     shift = move * _with_lanes(chain.slide, 1, axes)
