@@ -72,6 +72,12 @@ def request(name: str, function: Callable, arguments: tuple) -> Future[Program]:
         return _compiled[key]
 
 
+def all_requested() -> list[Future[Program]]:
+    """Every program that was requested in this process so far, in that order."""
+    with _lock:
+        return list(_compiled.values())
+
+
 def _compile(name: str, function: Callable, shapes: tuple) -> Program:
     start = time.perf_counter()
     executable = function.lower(*shapes).compile()
