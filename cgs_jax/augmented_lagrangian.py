@@ -139,7 +139,8 @@ def step(system: System, state: State, data: PyTree, settings: Settings) -> Stat
     state = state._replace(
         x=x,
         pressed=pressed,
-        iteration=state.iteration + moving,
+        # A lane that is not finite counts too: that it was looked at is what ends it.
+        iteration=state.iteration + (violation > settings.tolerance),
         violation=violation,
         residual=jnp.where(jnp.isfinite(squared), squared, jnp.inf),
     )
