@@ -1,0 +1,442 @@
+"""Sample a scene: many full assignments that satisfy every constraint, each checked in double precision.
+
+    python scripts/sample.py --scene banana
+    python scripts/sample.py --scene handover --instance 3 --time-budget 30 --out runs/mine
+    python scripts/sample.py --scene handover --method "p; t_a; t_b; q_a1; q_a2; q_b2; q_b1"
+
+Writes samples.npz, tree.json and run.json. Exit status: 0 with at least one sample (also after Ctrl-C), 3 with none (one
+line says which operator and constraint stopped it), 2 for bad input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import math
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import cgs_jax
+from cgs_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from cgs_jax.record import Recorder
+    from cgs_jax.samples import SampleSet
+    from cgs_jax.scene import Task
+
+TREES = ("tree", "tree-warm")
+WRITTEN = ("samples.npz", "tree.json", "run.json", "profile.json", "samples_sheet.png", "samples.gif")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
+
+
+def parser() -> Parser:
+    parse = Parser(
+        prog="sample.py",
+        description="Sample a scene: many full assignments that satisfy every constraint.",
+        epilog="Exit status: 0 with at least one sample, 3 with none, 2 for bad input. Ctrl-C keeps what was found.",
+        allow_abbrev=False,
+    )
+    parse.add_argument("--scene", required=True, metavar="NAME", help="a scene that comes with the package, or a task file")
+    parse.add_argument("--instance", type=int, default=0, metavar="N", help="instance of the scene, from 0 (default 0)")
+
+    budget = parse.add_argument_group("how long")
+    budget.add_argument("--time-budget", type=float, default=10.0, metavar="S", help="seconds of sampling (default 10)")
+    budget.add_argument("--num-samples", type=int, metavar="N", help="stop at this many samples")
+
+    search = parse.add_argument_group("how")
+    search.add_argument(
+        "--method",
+        default="tree",
+        metavar="M",
+        help="tree (default), tree-warm, rand, a sequence named in the task file, or a sequence as text: 't; q1; q2'",
+    )
+    search.add_argument("--batch-size", default="auto", metavar="N", help="tasks of one batch, or auto (default)")
+    search.add_argument("--seed", type=int, default=0, metavar="N", help="of the random numbers (default 0)")
+    search.add_argument(
+        "--deterministic", action="store_true", help="same seed, same samples in the same order, whatever the machine's load"
+    )
+    search.add_argument(
+        "--warm-start",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="tree.json of an earlier run to start from; may be repeated",
+    )
+    search.add_argument("--c-uct", type=float, metavar="X", help="weight of exploration in the tree")
+    search.add_argument(
+        "--reward",
+        choices=("rate", "rollout"),
+        default="rate",
+        help="reading of the paper's cost: per finished sample (rate, default) or per rollout",
+    )
+    search.add_argument("--tries", type=int, metavar="N", help="tries of a partial sample per operator; 1 as in the paper")
+    search.add_argument("--no-pools", action="store_true", help="drop the whole partial sample on a failure, as in the paper")
+
+    output = parse.add_argument_group("output")
+    output.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default runs/SCENE-INSTANCE)")
+    output.add_argument("--save-tree", type=Path, metavar="FILE", help="also write the tree's statistics here")
+    output.add_argument("--diverse", type=int, metavar="K", help="keep the K samples that differ most, most different first")
+    output.add_argument("--json", action="store_true", help="print run.json, and nothing else, on standard output")
+    output.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    output.add_argument("--profile", action="store_true", help="print and save (profile.json) where the time went")
+    output.add_argument("--render", action="store_true", help="write a contact sheet and a GIF of diverse samples")
+    output.add_argument("--view", action="store_true", help="show the samples in a web page at the end")
+    output.add_argument("--no-cache", action="store_true", help="keep no compiled programs on disk")
+    return parse
+
+
+# ------------------------------------------------------------------ checks before anything heavy is imported
+
+
+def check_numbers(options: argparse.Namespace) -> None:
+    """Raises InputError for numbers that make no sense; turns the batch size into a number, or None for auto."""
+    if not options.time_budget > 0:
+        raise InputError(f"--time-budget is {options.time_budget:g}, expected more than 0 seconds")
+    for name in ("num_samples", "tries", "diverse"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+    if not 0 <= options.seed < 2**32:
+        raise InputError(f"--seed is {options.seed}, expected 0 to {2**32 - 1}")
+    if options.c_uct is not None and not (options.c_uct > 0 and math.isfinite(options.c_uct)):
+        raise InputError(f"--c-uct is {options.c_uct:g}, expected a number above 0")
+    if options.batch_size == "auto":
+        options.batch_size = None
+    else:
+        try:
+            options.batch_size = int(options.batch_size)
+        except ValueError:
+            raise InputError(f"--batch-size is '{options.batch_size}', expected a whole number or auto") from None
+        if options.batch_size < 1:
+            raise InputError(f"--batch-size is {options.batch_size}, expected at least 1")
+    if options.warm_start and options.method not in TREES:
+        raise InputError(f"--warm-start has no effect on method '{options.method}', expected one of: {', '.join(TREES)}")
+
+
+def check_scene(options: argparse.Namespace) -> Task:
+    """The task, its instance known to exist; imports nothing of JAX."""
+    from cgs_jax.scene import load_task
+
+    task = load_task(options.scene)
+    if not 0 <= options.instance < len(task.instances):
+        raise InputError(
+            f"instance {options.instance} of scene '{task.name}' does not exist, expected 0 to {len(task.instances) - 1}"
+        )
+    return task
+
+
+def check_viewers(options: argparse.Namespace) -> None:
+    """Raises InputError when pictures or the web page that were asked for cannot be made on this machine."""
+    if options.view and importlib.util.find_spec("viser") is None:
+        raise InputError('--view needs the package viser, install it with: pip install -e ".[viewer]"')
+    if options.render:
+        from cgs_jax import render
+
+        render.backend()
+
+
+@contextlib.contextmanager
+def writable(*folders: Path) -> Iterator[None]:
+    """Makes the folders and tries to write there; folders made here go again when the block fails.
+
+    Raises InputError when one cannot be written.
+    """
+    made: list[Path] = []
+    try:
+        for folder in folders:
+            missing = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+            try:
+                for path in reversed(missing):
+                    path.mkdir()
+                    made.append(path)
+                with tempfile.TemporaryFile(dir=folder):
+                    pass
+            except OSError as error:
+                raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
+        yield
+    except BaseException:
+        for path in reversed(made):
+            with contextlib.suppress(OSError):
+                path.rmdir()
+        raise
+
+
+# ------------------------------------------------------------------ the live line
+
+
+class LiveLine:
+    """What the run is doing, in one line of the terminal's error stream; silent where that is no terminal."""
+
+    def __init__(self, shown: bool) -> None:
+        self._live: Any = None
+        self.phase, self.detail = "loading", ""
+        self._since = time.perf_counter()
+        self._looked = 0.0
+        if shown and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(get_renderable=self._text, console=Console(stderr=True), refresh_per_second=8, transient=True)
+
+    def __enter__(self) -> LiveLine:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def enter_phase(self, phase: str, detail: str = "") -> None:
+        """The clock starts anew when the phase is another."""
+        if phase != self.phase:
+            self._since = time.perf_counter()
+        self.phase, self.detail = phase, detail
+
+    def look(self, record: Recorder) -> None:
+        """Reads the record, at most a few times a second: asking for the best sequence costs host time."""
+        now = time.perf_counter()
+        if self._live is None or now - self._looked < 0.5:
+            return
+        self._looked = now
+        elapsed = now - self._since
+        best = record.best_sequences(1)
+        best_text = f" · best: {best[0][0]}" if best else ""
+        self.detail = f"{record.count} samples · {record.count / max(elapsed, 1e-9):.0f}/s{best_text}"
+
+    def _text(self) -> Any:
+        from rich.text import Text
+
+        seconds = time.perf_counter() - self._since
+        parts = [f"{self.phase} {seconds:5.1f} s", *([self.detail] if self.detail else [])]
+        return Text(" · ".join(parts), no_wrap=True, overflow="ellipsis")
+
+
+# ------------------------------------------------------------------ running
+
+
+def run(options: argparse.Namespace) -> int:
+    """Checks, samples, writes, reports; returns the exit status. Raises InputError for bad input."""
+    check_numbers(options)
+    task = check_scene(options)
+    check_viewers(options)
+    folder = options.out if options.out is not None else Path("runs") / f"{task.name}-{options.instance}"
+    with LiveLine(not options.quiet) as line:
+        if not options.no_cache:
+            cgs_jax.enable_disk_cache()
+        problem = cgs_jax.load_problem(options.scene, options.instance)
+        prior = [cgs_jax.load_tree(path) for path in options.warm_start]
+        settings = cgs_jax.SamplerSettings(
+            pools=not options.no_pools,
+            deterministic=options.deterministic,
+            **{name: getattr(options, name) for name in ("batch_size", "tries") if getattr(options, name) is not None},
+        )
+        sampling = cgs_jax.Run(
+            problem, options.method, options.seed, settings, prior, c_uct=options.c_uct, reward=options.reward
+        )
+        folders = [folder] + ([options.save_tree.parent] if options.save_tree else [])
+        if options.save_tree and options.save_tree.is_dir():
+            raise InputError(f"cannot write to {options.save_tree}: it is a folder, expected the name of a file")
+        with writable(*folders):
+            drive(sampling, options, line)
+            line.enter_phase("writing")
+            samples = write(sampling.record, options, folder)
+    return report(sampling.record, samples, options, folder)
+
+
+def drive(sampling: cgs_jax.Run, options: argparse.Namespace, line: LiveLine) -> None:
+    """Runs to the end of the budget; the first Ctrl-C ends it early, a second one at once."""
+
+    def stop(*_: object) -> None:
+        sampling.stop()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, stop)
+    line.enter_phase("compiling")
+    try:
+        for event in sampling.events(options.time_budget, options.num_samples):
+            kind = type(event).__name__
+            if kind == "Compiled" and line.phase == "compiling":
+                line.enter_phase("compiling", f"{len(sampling.record.programs)} programs ready")
+            elif kind == "Started":
+                line.enter_phase("sampling", "0 samples")
+            elif line.phase == "sampling":
+                line.look(sampling.record)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def write(record: Recorder, options: argparse.Namespace, folder: Path) -> SampleSet:
+    """Writes all files, in place of those of an earlier run; returns the samples that were kept."""
+    samples = record.samples()
+    if options.diverse is not None:
+        samples = samples.select(samples.diverse(options.diverse))
+    for name in WRITTEN:
+        (folder / name).unlink(missing_ok=True)
+    try:
+        record.save(folder, samples)
+        if options.save_tree:
+            record.save_tree(options.save_tree)
+        if options.profile:
+            record.save_profile(folder / "profile.json")
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
+    if options.render and len(samples):
+        from cgs_jax import render
+
+        render.save_pictures(samples, folder)
+    return samples
+
+
+# ------------------------------------------------------------------ the report
+
+
+def report(record: Recorder, samples: SampleSet, options: argparse.Namespace, folder: Path) -> int:
+    """Prints what was found and where it is; returns the exit status."""
+    if options.json:
+        print((folder / "run.json").read_text(encoding="utf-8"), end="")
+    elif not options.quiet:
+        from rich.console import Console
+
+        # A pipe has no width of its own; what reads it can cut lines, but not join them.
+        console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+        print_summary(console, record, samples)
+        if options.profile:
+            print_profile(console, record)
+        console.print(f"\nWritten to {folder}", soft_wrap=True)
+    sys.stdout.flush()
+    if not record.count:
+        print(f"sample.py: no sample: {record.diagnosis()}", file=sys.stderr)
+        return 3
+    if options.view:
+        from cgs_jax import viewer
+
+        page = viewer.WebViewer(samples)
+        print(f"{len(samples)} samples at {page.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+        page.run()
+    return 0
+
+
+def table(*columns: str) -> Table:
+    """An empty table; the first column is text, the others are numbers."""
+    from rich import box
+    from rich.table import Table
+
+    result = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for i, name in enumerate(columns):
+        result.add_column(name, justify="right" if i else "left", overflow="fold")
+    return result
+
+
+def percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def print_summary(console: Console, record: Recorder, samples: SampleSet) -> None:
+    """Rate, times, success per operator with its causes, best sequences, spread of the configurations."""
+    meta = record.meta()
+    kept = f", kept {len(samples)}" if len(samples) < record.count else ""
+    console.print(
+        f"[bold]{meta['scene']}[/] instance {meta['instance']}, method {meta['method']}, seed {meta['seed']}: "
+        f"[bold]{record.count} samples in {record.elapsed:.1f} s, {record.rate:.1f}/s[/]{kept} (ended by {record.reason})",
+        soft_wrap=True,
+    )
+    console.print(
+        f"before sampling {record.startup_seconds:.1f} s, compiling {record.compile_seconds:.1f} s "
+        f"({len(record.programs)} programs, partly beside sampling), audit rejected {record.rejected}",
+        soft_wrap=True,
+    )
+    operators = table("operator (new | given)", "tasks", "success", "condition feasible", "solver on those", "stopped by")
+    for name, operator in record.operators.items():
+        causes = operator.causes
+        worst = sorted(operator.failures, key=operator.failures.__getitem__, reverse=True)[:2]
+        operators.add_row(
+            name,
+            str(operator.tasks),
+            percent(operator.success_rate),
+            percent(causes[0] if causes else None),
+            percent(causes[1] if causes else None),
+            ", ".join(worst),
+        )
+    console.print()
+    console.print(operators)
+    best = record.best_sequences(3)
+    if record.count and best:
+        sequences = table("best sequences", "predicted /s")
+        for text, rate in best:
+            sequences.add_row(text, f"{rate:.0f}")
+        console.print()
+        console.print(sequences)
+    if len(samples):
+        spread = table("samples of", "at a joint limit", "near-duplicates")
+        for name, shares in record.spread(samples).items():
+            spread.add_row(name, percent(shares["limit_share"]), percent(shares["duplicate_share"]))
+        console.print()
+        console.print(spread)
+
+
+def print_profile(console: Console, record: Recorder) -> None:
+    """Where the time went."""
+    profile = record.profile()
+    operators = table("profile (new | given)", "calls", "tasks", "iterations/task", "success", "us/task", "device s", "share")
+    total = max(record.device_seconds, 1e-12)
+    for name, entry in profile["operators"].items():
+        operators.add_row(
+            name,
+            str(entry["calls"]),
+            str(entry["tasks"]),
+            f"{entry['iterations_per_task']:.1f}",
+            percent(entry["success_rate"]),
+            f"{entry['microseconds_per_task']:.1f}",
+            f"{entry['device_seconds']:.2f}",
+            percent(entry["device_seconds"] / total),
+        )
+    console.print()
+    console.print(operators)
+    shares = table("share of the workers' time", "")
+    for name, share in profile["shares_of_worker_time"].items():
+        shares.add_row(name, percent(share))
+    console.print()
+    console.print(shares)
+    programs = table("programs", "s to compile or load")
+    for program in sorted(profile["programs"], key=lambda entry: -entry["seconds"]):
+        programs.add_row(program["name"], f"{program['seconds']:.2f}")
+    console.print()
+    console.print(programs)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns the exit status."""
+    try:
+        return run(parser().parse_args(arguments))
+    except InputError as error:
+        print(f"sample.py: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("sample.py: interrupted before the first sample", file=sys.stderr)
+        return 3
+
+
+if __name__ == "__main__":
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if "jax" in sys.modules:
+        cgs_jax.end_process(status)
+    sys.exit(status)
