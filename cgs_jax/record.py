@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cgs_jax.audit import Auditor
+from cgs_jax.coverage import duplicate_share, limit_share
 from cgs_jax.problems import Problem
 from cgs_jax.sampler import Compiled, Event, Finished, Found, Ran, SamplerSettings, Started
 from cgs_jax.samples import SampleSet
@@ -219,16 +220,45 @@ class Recorder:
             f"{constraint} stopped {share:.0f} % of its failures"
         )
 
-    def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Writes samples.npz (if there is a sample), tree.json and run.json into a folder; returns the folder."""
+    def spread(self, samples: SampleSet) -> dict[str, dict[str, float]]:
+        """Per configuration variable: share of samples with a joint at a limit, and share with a near-duplicate."""
+        task, model = self.problem.scene.task, self.problem.scene.model
+        robots = {variable: robot for switch in task.switches for robot, variable in switch.configurations.items()}
+        shares = {}
+        for name, robot in robots.items():
+            low, high = np.array([model.joint(joint).range for joint in task.robot(robot).joints]).T
+            values = samples[name]
+            shares[name] = {"limit_share": limit_share(values, low, high), "duplicate_share": duplicate_share(values)}
+        return shares
+
+    def save(self, folder: str | os.PathLike[str], samples: SampleSet | None = None) -> Path:
+        """Writes samples.npz (if there is a sample), tree.json and run.json into a folder; returns the folder.
+
+        samples: what is to be written in place of all that were found.
+        """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        if self.count:
-            self.samples().save(folder / "samples.npz")
-        chooser: Any = self.chooser
-        write_json(folder / "tree.json", chooser.as_json())
-        write_json(folder / "run.json", self.meta() | {"best_sequences": self.best_sequences(3)} | self.profile())
+        samples = self.samples() if samples is None else samples
+        if len(samples):
+            samples.save(folder / "samples.npz")
+        self.save_tree(folder / "tree.json")
+        results = {
+            "samples_written": len(samples),
+            "diagnosis": None if self.count else self.diagnosis(),
+            "best_sequences": self.best_sequences(3),
+            "spread": self.spread(samples),
+        }
+        write_json(folder / "run.json", self.meta() | results | self.profile())
         return folder
+
+    def save_tree(self, path: str | os.PathLike[str]) -> None:
+        """Writes the statistics that the chooser gathered, for `load_tree`."""
+        chooser: Any = self.chooser
+        write_json(Path(path), chooser.as_json())
+
+    def save_profile(self, path: str | os.PathLike[str]) -> None:
+        """Writes `profile` as JSON."""
+        write_json(Path(path), self.profile())
 
 
 def operator_text(transition: Transition) -> str:
