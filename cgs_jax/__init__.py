@@ -21,6 +21,7 @@ _HOMES = {
     "Tolerances": "audit",
     "available_scenes": "scene",
     "enable_disk_cache": "programs",
+    "end_process": "programs",
     "load_problem": "problems",
     "load_tree": "api",
     "make_chooser": "api",

@@ -6,15 +6,17 @@ never counted as sampling, and so that a scheduler can ask whether a program is 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
+from filelock import FileLock, Timeout
 
 CACHE_BYTES = 512 * 2**20
 """Size to which the cache on disk is kept; the programs used longest ago go first."""
@@ -36,6 +38,20 @@ def enable_disk_cache(folder: str | os.PathLike[str] | None = None) -> Path:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     jax.config.update("jax_compilation_cache_max_size", CACHE_BYTES)
     return path
+
+
+def end_process(status: int) -> NoReturn:
+    """Ends the process at once, where a normal exit would wait for every program that is still to be compiled.
+
+    Waits for a write to the cache on disk to end: JAX cannot read an entry that was cut short, nor make room beside one.
+    """
+    folder = jax.config.values.get("jax_compilation_cache_dir")
+    if folder and os.path.isdir(folder):
+        # Held until the process is gone, so that no further write begins.
+        lock = FileLock(os.path.join(folder, ".lockfile"), timeout=10)
+        with contextlib.suppress(Timeout, OSError):
+            lock.acquire()
+    os._exit(status)
 
 
 class Program:
