@@ -120,6 +120,8 @@ def step(system: System, state: State, data: PyTree, settings: Settings) -> Stat
     rows = system.rows(state.x, data)
     violation = jnp.max(jnp.abs(distance_to_interval(rows.value, rows.low, rows.high)), axis=0)
     violation = jnp.where(jnp.isfinite(violation), violation, jnp.inf)
+    if settings.multiplier_period:
+        state = _update_multipliers(state, rows, violation, settings)
     shifted = rows.value + state.multipliers / state.penalty
     outside = distance_to_interval(shifted, rows.low, rows.high) != 0
     active = outside | (rows.low == rows.high)
@@ -136,7 +138,7 @@ def step(system: System, state: State, data: PyTree, settings: Settings) -> Stat
     move = jnp.clip(move, least, most)
     moving = (violation > settings.tolerance) & jnp.isfinite(squared)
     x = jax.tree.map(lambda new, old: jnp.where(moving, new, old), system.retract(state.x, move), state.x)
-    state = state._replace(
+    return state._replace(
         x=x,
         pressed=pressed,
         # A lane that is not finite counts too: that it was looked at is what ends it.
@@ -144,18 +146,15 @@ def step(system: System, state: State, data: PyTree, settings: Settings) -> Stat
         violation=violation,
         residual=jnp.where(jnp.isfinite(squared), squared, jnp.inf),
     )
-    if settings.multiplier_period:
-        state = _update_multipliers(state, residual, moving, settings)
-    return state
 
 
-def _update_multipliers(state: State, residual: jax.Array, moving: jax.Array, settings: Settings) -> State:
-    """First-order update `y <- rho * d(c + y / rho)`; rho grows where the violation did not halve."""
-    due = moving & (state.iteration % settings.multiplier_period == 0)
-    slow = state.violation > 0.5 * state.updated
-    multipliers = jnp.where(due, state.penalty * residual, state.multipliers)
-    penalty = jnp.where(due & slow, state.penalty * settings.penalty_growth, state.penalty)
-    return state._replace(multipliers=multipliers, penalty=penalty, updated=jnp.where(due, state.violation, state.updated))
+def _update_multipliers(state: State, rows: Rows, violation: jax.Array, settings: Settings) -> State:
+    """First-order update `y <- rho * d(c + y / rho)` at x; rho grows where the violation did not halve."""
+    due = (state.iteration > 0) & (state.iteration % settings.multiplier_period == 0) & (violation > settings.tolerance)
+    shifted = rows.value + state.multipliers / state.penalty
+    multipliers = jnp.where(due, state.penalty * distance_to_interval(shifted, rows.low, rows.high), state.multipliers)
+    penalty = jnp.where(due & (violation > 0.5 * state.updated), state.penalty * settings.penalty_growth, state.penalty)
+    return state._replace(multipliers=multipliers, penalty=penalty, updated=jnp.where(due, violation, state.updated))
 
 
 def finished(state: State, settings: Settings) -> jax.Array:
