@@ -14,11 +14,13 @@ have their lanes (independent problems) last.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import optax
 from jax import lax
 
 PyTree = Any
@@ -349,3 +351,102 @@ def project_queue(
     return Projection(
         points.unpack(results[:, :size].T), violation <= settings.tolerance, violation, results[:, size + 1].astype(jnp.int32)
     )
+
+
+# ------------------------------------------------------------------ with a cost
+
+
+@dataclass(frozen=True)
+class CostSettings:
+    """How a minimisation runs."""
+
+    tolerance: float = 2.5e-5
+    """Largest violation of any row that counts as feasible."""
+    multiplier_tolerance: float = 1e-3
+    """Largest change of a multiplier, relative to the largest, at which the outer loop ends."""
+    outer_iterations: int = 20
+    """Largest number of multiplier updates."""
+    inner_iterations: int = 40
+    """L-BFGS iterations between two updates."""
+    gradient_tolerance: float = 1e-5
+    """Norm of the gradient at which the inner loop ends."""
+    penalty: float = 10.0
+    """Initial penalty rho."""
+    penalty_growth: float = 4.0
+    """Factor on rho after an update that did not bring the violation to a quarter."""
+    largest_penalty: float = 1e4
+    """Single precision cannot tell the cost beside a larger one."""
+
+
+class Minimum(NamedTuple):
+    """Outcome of one minimisation."""
+
+    x: jax.Array  # (n,)
+    cost: jax.Array  # ()
+    feasible: jax.Array  # () bool
+    violation: jax.Array  # () largest row violation
+    multipliers: jax.Array  # (m,) positive where a row presses on its upper end, negative on its lower end
+
+
+def minimise(
+    cost: Callable[[jax.Array], jax.Array],
+    rows: Callable[[jax.Array], jax.Array],
+    low: jax.Array,
+    high: jax.Array,
+    x: jax.Array,
+    settings: CostSettings | None = None,
+) -> Minimum:
+    """Minimises a smooth cost subject to `low <= rows(x) <= high` from x, for one lane (`jax.vmap` it over lanes).
+
+    cost: `(n,)` to a number; rows: `(n,)` to `(m,)`; low, high: `(m,)`, infinite where open. The augmented Lagrangian
+    `f + rho / 2 * |d(c + y / rho)|^2` is minimised by L-BFGS between the updates `y <- rho * d(c + y / rho)`. Samples do not
+    need it and are more diverse without; with a cost the multipliers do not vanish, so that a penalty alone would stop short.
+    """
+    settings = settings or CostSettings()
+    solver = optax.lbfgs()
+    low, high = jnp.asarray(low, x.dtype), jnp.asarray(high, x.dtype)
+
+    def lagrangian(x: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
+        outside = distance_to_interval(rows(x) + multipliers / penalty, low, high)
+        return cost(x) + 0.5 * penalty * jnp.sum(outside * outside)
+
+    def descend(x: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
+        def value(x: jax.Array) -> jax.Array:
+            return lagrangian(x, multipliers, penalty)
+
+        value_and_gradient = optax.value_and_grad_from_state(value)
+
+        def advance(carry: tuple[jax.Array, Any, jax.Array, jax.Array]) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
+            x, state, count, _ = carry
+            at, gradient = value_and_gradient(x, state=state)
+            step, state = solver.update(gradient, state, x, value=at, grad=gradient, value_fn=value)
+            return optax.apply_updates(x, step), state, count + 1, jnp.linalg.norm(gradient)
+
+        def unfinished(carry: tuple[jax.Array, Any, jax.Array, jax.Array]) -> jax.Array:
+            return (carry[2] < settings.inner_iterations) & (carry[3] > settings.gradient_tolerance)
+
+        start = (x, solver.init(x), jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, x.dtype))
+        return lax.while_loop(unfinished, advance, start)[0]
+
+    def update(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        x, multipliers, penalty, violation, count, _ = carry
+        x = descend(x, multipliers, penalty)
+        value = rows(x)
+        renewed = penalty * distance_to_interval(value + multipliers / penalty, low, high)
+        now = jnp.max(jnp.abs(distance_to_interval(value, low, high)))
+        change = jnp.max(jnp.abs(renewed - multipliers)) / (1.0 + jnp.max(jnp.abs(renewed)))
+        grown = jnp.minimum(penalty * settings.penalty_growth, settings.largest_penalty)
+        slow = (now > 0.25 * violation) & (now > settings.tolerance)
+        return x, renewed, jnp.where(slow, grown, penalty), now, count + 1, change
+
+    def busy(carry: tuple[jax.Array, ...]) -> jax.Array:
+        _, _, _, violation, count, change = carry
+        converged = (violation <= settings.tolerance) & (change <= settings.multiplier_tolerance)
+        return (count < settings.outer_iterations) & ~converged & ((count == 0) | jnp.isfinite(violation))
+
+    infinite = jnp.asarray(jnp.inf, x.dtype)
+    start = (x, jnp.zeros_like(low), jnp.asarray(settings.penalty, x.dtype), infinite, jnp.zeros((), jnp.int32), infinite)
+    x, multipliers, _, violation, _, _ = lax.while_loop(busy, update, start)
+    value = cost(x)
+    feasible = (violation <= settings.tolerance) & jnp.isfinite(value)
+    return Minimum(x, value, feasible, violation, multipliers)

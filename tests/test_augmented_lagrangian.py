@@ -42,7 +42,9 @@ def test_projection_on_a_plane_is_orthogonal(settings):
     normal = np.array([1.0, 2.0, -2.0]) / 3.0
     x = seeds(3, 16)
     # Little damping: undamped, one step is the orthogonal projection.
-    result = al.project(Rows(lambda v: (normal @ v)[None], 0.5, 0.5), x, None, replace(settings, damping=0.0, max_step=9.0))
+    result = al.project(
+        Rows(lambda v: (normal @ v)[None], 0.5, 0.5), x, None, replace(settings, damping=0.0, max_step=9.0)
+    )
     expected = np.asarray(x) - np.outer(normal, normal @ np.asarray(x) - 0.5)
     assert result.feasible.all()
     np.testing.assert_allclose(result.x, expected, atol=1e-4)
@@ -59,7 +61,9 @@ def test_projection_on_a_sphere_stays_on_the_ray(settings):
 
 def test_box_cuts_the_step_and_the_others_take_over():
     # x + y = 1.5 in the box [-1, 1]^2 from the corner (1, -1): x is at its bound, so y alone moves.
-    result = al.project(Rows(lambda v: (v[0] + v[1])[None], 1.5, 1.5, box=1.0), jnp.array([[1.0], [-1.0]]), None, SETTINGS)
+    result = al.project(
+        Rows(lambda v: (v[0] + v[1])[None], 1.5, 1.5, box=1.0), jnp.array([[1.0], [-1.0]]), None, SETTINGS
+    )
     assert result.feasible.all()
     np.testing.assert_allclose(result.x[:, 0], [1.0, 0.5], atol=1e-4)
 
@@ -213,3 +217,92 @@ def test_lanes_that_are_not_numbers_fail(tasks):
     result = al.project(system, jnp.array([[-1.0, 1.0, np.nan, np.inf]]), None, SETTINGS)
     np.testing.assert_array_equal(result.feasible, [False, True, False, False])
     assert not np.isfinite(np.asarray(result.violation)[[0, 2]]).any()
+
+
+# ---------------------------------------------------------------- with a cost
+
+
+def rosenbrock(v):
+    return (1 - v[0]) ** 2 + 100 * (v[1] - v[0] ** 2) ** 2
+
+
+def nearest_to(point):
+    return lambda v: jnp.sum((v - jnp.asarray(point)) ** 2)
+
+
+INF = np.inf
+MINIMA = {
+    # cost, rows, low, high, start, minimum, multipliers
+    "point on a circle": (
+        nearest_to([3.0, 4.0]),
+        lambda v: (v @ v)[None],
+        [1.0],
+        [1.0],
+        [0.4, -0.2],
+        [0.6, 0.8],
+        [4.0],
+    ),
+    "half space, active": (
+        nearest_to([2.0, 2.0]),
+        lambda v: v[:1] + v[1:],
+        [-INF],
+        [2.0],
+        [0.0, -3.0],
+        [1.0, 1.0],
+        [2.0],
+    ),
+    "half space, idle": (nearest_to([0.5, 0.5]), lambda v: v[:1] + v[1:], [-INF], [2.0], [3.0, 3.0], [0.5, 0.5], [0.0]),
+    "lower end of an interval": (
+        nearest_to([-3.0, 1.0]),
+        lambda v: v[:1],
+        [-1.0],
+        [1.0],
+        [0.0, 0.0],
+        [-1.0, 1.0],
+        [-4.0],
+    ),
+    # min x'x + y'y with x + 2y = 5 and x - y = -1.
+    "quadratic with equalities": (
+        lambda v: v @ v,
+        lambda v: jnp.stack([v[0] + 2 * v[1], v[0] - v[1]]),
+        [5.0, -1.0],
+        [5.0, -1.0],
+        [0.0, 0.0],
+        [1.0, 2.0],
+        [-2.0, 0.0],
+    ),
+    # The known minimum of Rosenbrock's function on the disc of radius 1.
+    "Rosenbrock on a disc": (
+        rosenbrock,
+        lambda v: (v @ v)[None],
+        [-INF],
+        [1.0],
+        [-0.5, 0.2],
+        [0.786415, 0.617698],
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MINIMA)
+def test_minimum_under_constraints(name):
+    cost, rows, low, high, start, expected, multipliers = MINIMA[name]
+    low, high = jnp.asarray(low), jnp.asarray(high)
+    # Lanes beside each other, one at the given start and one elsewhere.
+    starts = jnp.asarray([start, np.array(start) + 0.1])
+    result = jax.jit(jax.vmap(lambda x: al.minimise(cost, rows, low, high, x)))(starts)
+    assert result.feasible.all()
+    np.testing.assert_allclose(result.x, np.tile(expected, (2, 1)), atol=1e-3)
+    np.testing.assert_allclose(result.cost, cost(jnp.asarray(expected)), atol=2e-3)
+    if multipliers is not None:
+        np.testing.assert_allclose(result.multipliers, np.tile(multipliers, (2, 1)), atol=2e-2)
+
+
+def test_minimum_under_contradictions_is_infeasible():
+    result = al.minimise(
+        nearest_to([0.0]), lambda v: jnp.stack([v[0], v[0]]), jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]), jnp.zeros(1)
+    )
+    assert not result.feasible and result.violation > 0.4
+    assert not al.minimise(
+        lambda v: jnp.sqrt(v[0]), lambda v: v, jnp.array([-1.0]), jnp.array([-1.0]), jnp.ones(1)
+    ).feasible
