@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def make_chooser(
     seed: int = 0,
     prior: Sequence[Mapping[str, Any]] = (),
     c_uct: float | None = None,
-    reward: str = "rate",
+    reward: Literal["rate", "rollout"] = "rate",
     pools: bool = True,
 ) -> Chooser:
     """The chooser of a method.
@@ -50,7 +50,7 @@ def make_chooser(
         options: dict[str, Any] = {} if c_uct is None else {"c_uct": c_uct}
         tree = Tree(transitions, reward=reward, retain=pools, **options)
         if prior:
-            tree.warm_start(list(prior), WARM_VISITS)
+            tree.warm_start([dict(earlier) for earlier in prior], WARM_VISITS)
         return tree
     if method == "rand":
         return Random(transitions, seed, retain=pools)

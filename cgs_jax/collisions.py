@@ -170,7 +170,8 @@ def read_shapes(model: mujoco.MjModel, geoms: list[Geom]) -> tuple[Shapes, list[
 
     A geom may be listed more than once: an object stands still at its start at one switch, at its goal at another.
     """
-    capsules, boxes = [], []
+    capsules: list[tuple] = []
+    boxes: list[tuple] = []
     places: list[tuple[str, int]] = []
     for geom in geoms:
         kind, size = int(model.geom_type[geom.index]), model.geom_size[geom.index]

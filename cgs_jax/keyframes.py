@@ -24,8 +24,8 @@ class Keyframes:
         self._poses: list[list[tuple[Product, int]]] = []
         for switch in task.switches:
             addresses = []
-            for robot, variable in switch.configurations.items():
-                joints = task.robot(robot).joints
+            for name, variable in switch.configurations.items():
+                joints = task.robot(name).joints
                 addresses.append((variable, np.array([model.jnt_qposadr[model.joint(j).id] for j in joints])))
             self._configurations.append(addresses)
             poses = [(problem.object_poses[o.name, switch.name], self._address(o.body)) for o in task.objects]

@@ -94,7 +94,7 @@ def all_requested() -> list[Future[Program]]:
         return list(_compiled.values())
 
 
-def _compile(name: str, function: Callable, shapes: tuple) -> Program:
+def _compile(name: str, function: Any, shapes: tuple) -> Program:
     start = time.perf_counter()
     executable = function.lower(*shapes).compile()
     return Program(name, executable, time.perf_counter() - start)

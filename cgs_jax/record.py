@@ -253,8 +253,7 @@ class Recorder:
 
     def save_tree(self, path: str | os.PathLike[str]) -> None:
         """Writes the statistics that the chooser gathered, for `load_tree`."""
-        chooser: Any = self.chooser
-        write_json(Path(path), chooser.as_json())
+        write_json(Path(path), self.chooser.as_json())
 
     def save_profile(self, path: str | os.PathLike[str]) -> None:
         """Writes `profile` as JSON."""

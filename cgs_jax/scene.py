@@ -571,7 +571,7 @@ def _read_instance(table: _Table, placements: tuple[Placement, ...]) -> Instance
         for key in edit.values:
             if key not in allowed:
                 raise edit.fail(f"unknown key '{key}'; allowed: {_listed(allowed)}")
-        base = {"low": list(original.low), "high": list(original.high)}
+        base: dict[str, Any] = {"low": list(original.low), "high": list(original.high)}
         if not ({"quat", "upright"} & edit.values.keys()):
             base |= {"upright": original.upright} | ({"quat": list(original.quat)} if original.quat else {})
         regions[variable] = _read_region(_Table(base | edit.values, edit.where))

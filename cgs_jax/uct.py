@@ -83,7 +83,12 @@ class Statistics:
 class Chooser(Protocol):
     """What the sampler needs: Tree, Fixed and Random have it."""
 
-    rate: float
+    @property
+    def rate(self) -> float: ...
+
+    def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]: ...
+
+    def as_json(self) -> dict[str, Any]: ...
 
     def select(self, ready: Ready | None = None) -> Path: ...
 
@@ -341,7 +346,8 @@ class _Records:
 
     def _node(self, path: Iterable[Transition]) -> _Node:
         """The node of a sequence, made when it is new."""
-        node, state = self._root, frozenset()
+        node: _Node = self._root
+        state: State = frozenset()
         for transition in path:
             if transition.given != state:
                 raise InputError(f"{transition} does not follow {self.transitions.format(node.path) or 'the start'!r}")
@@ -498,7 +504,8 @@ class Tree(_Records):
         if self._stale:
             self._refresh()
         price = self.price
-        node, state = self._root, frozenset()
+        node: _Node = self._root
+        state: State = frozenset()
         while state != self.transitions.full:
             children = self._expand(node, state)
             if not node.interior:

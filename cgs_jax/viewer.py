@@ -286,7 +286,7 @@ class WebViewer:
         title = samples.meta.get("scene", "samples")
         gui.add_markdown(f"### {title}\n{len(self._pool)} samples, {len(samples.mode_switches)} mode switches")
         used, counts = np.unique(samples.sequence[self._pool], return_counts=True)
-        self._sequence_of_option = {f"{_ALL} ({len(self._pool)})": None}
+        self._sequence_of_option: dict[str, int | None] = {f"{_ALL} ({len(self._pool)})": None}
         for sequence, count in sorted(zip(used, counts, strict=True), key=lambda item: -item[1]):
             self._sequence_of_option[f"{samples.sequences[sequence]} ({count})"] = int(sequence)
         self._sequence_menu = gui.add_dropdown("Sequence", tuple(self._sequence_of_option))
@@ -372,7 +372,7 @@ class WebViewer:
     def _open_mujoco(self) -> None:
         try:
             if self._window is None or not self._window.is_open():
-                self._window = MujocoWindow(self.samples, self._pool, self.switch)
+                self._window = MujocoWindow(self.samples, self._pool.tolist(), self.switch)
             self._window.show(self.sample, self._column)
         except InputError as error:
             self._text.content = str(error)

@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cgs_jax.errors import InputError
 from cgs_jax.samples import SampleSet
@@ -89,7 +90,7 @@ def show(options: argparse.Namespace) -> None:
         if path is not None and path.suffix.lower() != suffix:
             raise InputError(f"cannot write {path}: expected a name that ends in {suffix}")
     camera = render.Camera.parse(options.camera) if options.camera else None
-    size = {} if options.size is None else {"size": parse_size(options.size)}
+    size: dict[str, Any] = {} if options.size is None else {"size": parse_size(options.size)}
     switches = None
     if options.switch is not None:
         render.switch_index(samples, options.switch)
