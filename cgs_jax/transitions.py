@@ -133,7 +133,7 @@ class Transitions:
         path: list[Transition] = []
         state: State = frozenset()
         for number, step in enumerate(steps, start=1):
-            names = [n.strip() for n in step.strip().strip("()").split(",")] if isinstance(step, str) else list(step)
+            names = self._read_step(step, number) if isinstance(step, str) else list(step)
             match = next((t for t in self.children(state) if Counter(t.new) == Counter(names)), None)
             if match is None:
                 available = ", ".join(map(str, self.children(state))) or "nothing"
@@ -148,6 +148,14 @@ class Transitions:
             available = ", ".join(map(str, self.children(state)))
             raise InputError(f"sequence {self.format(path)!r} leaves {missing} unassigned; available next: {available}")
         return tuple(path)
+
+    @staticmethod
+    def _read_step(step: str, number: int) -> list[str]:
+        text = step.strip()
+        inner = text[1:-1] if text.startswith("(") and text.endswith(")") else text
+        if "(" in inner or ")" in inner:
+            raise InputError(f"step {number} ({text!r}) is not understood, expected a name such as t or names such as (q1,t)")
+        return [name.strip() for name in inner.split(",")]
 
     def format(self, path: Iterable[Transition]) -> str:
         """The text that parse() reads."""

@@ -301,6 +301,7 @@ def test_wrong_arguments_end_with_status_2_and_one_line(arguments, said, capsys,
         ("q1; t; q2", r"step 1 \(q1\) is not possible .*available: t, \(q1,t\)"),
         ("t; q1", "leaves q2 unassigned"),
         ("t; q9; q2", "q9"),
+        ("(t,q1; q2", r"step 1 \('\(t,q1'\) is not understood"),
         ("t; t; q1; q2", r"step 2 \(t\) is not possible after 't'; available: "),
     ],
 )
