@@ -432,16 +432,24 @@ def _tool_vector(chain: Chain, q: Array) -> Array:
     return to_vector(tool_pose(chain, joint_frames(chain, q.T[: chain.offset.shape[0]]))).T
 
 
+COMPILER_OPTIONS: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_use_fusion_emitters": False}
+"""Measured on `propose`: a quarter less time to run and to compile than XLA's defaults; other backends do not read them."""
+
+
 @functools.lru_cache(maxsize=None)
 def propose_program(layout: Layout, settings: al.Settings, lanes: int) -> Callable:
     """The jitted `propose` of a layout; the same object for the same arguments, so that it compiles once."""
-    return jax.jit(functools.partial(propose, layout, settings, lanes))
+    return jax.jit(functools.partial(propose, layout, settings, lanes), compiler_options=_compiler_options())
+
+
+def _compiler_options() -> dict[str, Any]:
+    return COMPILER_OPTIONS if jax.default_backend() == "cpu" else {}
 
 
 @functools.lru_cache(maxsize=None)
 def clearance_program(layout: ClearanceLayout) -> Callable:
     """The jitted `clearance` of a layout."""
-    return jax.jit(functools.partial(clearance, layout))
+    return jax.jit(functools.partial(clearance, layout), compiler_options=_compiler_options())
 
 
 def gather_poses(clear: Clear, params: Params, values: Mapping[str, Array], tasks: int) -> Array:

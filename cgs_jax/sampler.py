@@ -190,7 +190,7 @@ class SamplerSettings:
 
     batch_size: int = 1024
     """Tasks of one batch."""
-    lanes: int = 64
+    lanes: int = 128
     """Tasks solved side by side."""
     tries: int = 4
     """Tries of a condition; it leaves at its first success. 1: the paper's semantics."""
