@@ -29,6 +29,7 @@ _HOMES = {
     "rollout": "api",
     "sample": "api",
     "stream": "api",
+    "with_constraint": "problems",
 }
 
 __all__ = sorted(_HOMES)

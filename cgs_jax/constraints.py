@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -206,7 +207,8 @@ def function_rows(
 
     def rows(steps: dict[str, jax.Array], point: dict[str, jax.Array | Pose]) -> jax.Array:
         result = function.function(**{name: moved(point[name], steps[name]) for name in function.scope})
-        return jnp.reshape(result, (function.rows,))
+        chex.assert_shape(result, (function.rows,))
+        return result
 
     zero = {name: jnp.zeros(6 if isinstance(v, Pose) else v.shape[0]) for name, v in values.items()}
 
