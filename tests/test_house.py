@@ -47,9 +47,13 @@ MAY_IMPORT = {
     "problems": {"errors", "graph", "transitions", "scene"} | MATHEMATICS,
     "operators": {"errors", "problems", "transitions"} | MATHEMATICS,
     "keyframes": {"constraints", "kinematics", "problems"},
+    "batches": {
+        "audit", "augmented_lagrangian", "keyframes", "operators", "problems", "programs", "scene", "transitions",
+    },
+    "worker": {"errors", "audit", "batches", "problems", "programs"},
     "sampler": {
-        "errors", "audit", "augmented_lagrangian", "keyframes", "operators", "problems", "programs", "scene",
-        "transitions", "uct",
+        "errors", "audit", "augmented_lagrangian", "batches", "keyframes", "operators", "problems", "programs", "scene",
+        "transitions", "uct", "worker",
     },
     # the porch
     "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
