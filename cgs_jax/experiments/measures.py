@@ -91,9 +91,9 @@ def coverage_of_instance(
 ) -> dict[str, Any]:
     """Projected coverage and cover radius of several methods on one instance.
 
-    values: by method, for each seed the samples by variable; "tree" is what the cells are fitted to. reference: held-out
-    samples by variable. least: a method with fewer samples in some seed is left out of the comparison at equal count.
-    Returns per variable the cell, how much of the reference's cells the tree fills, and per method one number for each
+    values: by method, for each seed the samples by variable; "tree" is what the cells are fitted to. reference:
+    held-out samples by variable. least: a method with fewer samples in some seed is left out of the comparison at equal
+    count. Returns per variable the cell, how much of the reference's cells the tree fills, and per method one number for each
     seed of: cells at equal time, cells at equal count, 0.9 quantile of the cover distance at equal time and count.
     """
     fitted = fit_cells(values["tree"][0], reference, kinds=kinds)

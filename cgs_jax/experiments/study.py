@@ -1,0 +1,480 @@
+"""The whole study: which runs there are, running those that are missing, and the numbers that come out.
+
+Stages, in order. compile: all programs. main: tree, the experts, rand. warm: tree with the statistics of the other
+instances. reference: held-out samples for coverage. sweep: price of time and exploration constant. survey: every
+operator. fixed: the sequences that the operators' statistics predict to be best, and those that the paper found, run.
+operations: single conditional operators, one try per lane.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+
+from cgs_jax.api import make_chooser
+from cgs_jax.errors import InputError
+from cgs_jax.experiments import measures
+from cgs_jax.experiments.runs import (
+    Run,
+    Store,
+    Survey,
+    execute,
+    merged_tree,
+    operation_name,
+    prepare,
+    priced_tree,
+    ranked_sequences,
+    signature,
+)
+from cgs_jax.problems import Problem, load_problem
+from cgs_jax.record import operator_text, write_json
+from cgs_jax.sampler import SamplerSettings
+from cgs_jax.uct import Path, Tree
+
+RUN_OVERHEAD = 0.8
+"""Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
+
+COMPILE_ESTIMATE = 45.0
+"""Seconds to compile a scene's programs on two cores; for the estimate."""
+
+HELD_OUT = 1000
+"""Seed of the runs that make the reference set; no other run has it."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much is run. Times in seconds of sampling, per run."""
+
+    seconds: float
+    seeds: int
+    instances: int | None = None  # None: all
+    coverage_least: int = 200  # samples that a method needs for the comparison at equal count
+    sweep_instances: int = 2
+    sweep_seeds: int = 3
+    prices: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0, 10.0)
+    exploration: tuple[float, ...] = (0.003, 0.01, 0.1, 0.3, 1.0)
+    oracle_instances: int | None = None
+    survey_seconds_per_operator: float = 0.4
+    top: int = 4
+    top_seeds: int = 2
+    operation_seconds: float = 4.0
+
+
+QUICK = Budget(
+    seconds=4.0,
+    seeds=2,
+    instances=2,
+    coverage_least=50,
+    sweep_instances=1,
+    sweep_seeds=1,
+    prices=(0.1, 1.0, 10.0),
+    exploration=(0.003, 0.3),
+    oracle_instances=1,
+    survey_seconds_per_operator=0.2,
+    top=3,
+    top_seeds=1,
+    operation_seconds=2.0,
+)
+
+FULL = Budget(seconds=10.0, seeds=5)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Before each run: what comes next, and how many seconds of the estimate are behind us."""
+
+    title: str
+    done: float
+    total: float
+
+
+class Study:
+    """One folder with all runs of some scenes. paper: what is printed there, by scene (`scripts/reproduce.toml`)."""
+
+    def __init__(
+        self,
+        folder: File,
+        scenes: Sequence[str],
+        budget: Budget,
+        paper: Mapping[str, Any],
+        settings: SamplerSettings | None = None,
+    ) -> None:
+        self.folder, self.scenes, self.budget, self.paper = folder, tuple(scenes), budget, paper
+        self.settings = settings or SamplerSettings()
+        self.store = Store(folder / "runs")
+        self._problems: dict[tuple[str, int], Problem] = {}
+        self._rankings: dict[tuple[str, int], list[tuple[Path, float]]] = {}
+
+    def problem(self, scene: str, instance: int = 0) -> Problem:
+        """An instance of a scene, loaded once."""
+        if (scene, instance) not in self._problems:
+            self._problems[scene, instance] = load_problem(scene, instance)
+        return self._problems[scene, instance]
+
+    def claim_folder(self) -> None:
+        """Makes the folder this study's. Raises InputError where it holds runs of another budget."""
+        path = self.folder / "study.json"
+        ours = json.loads(json.dumps({"budget": asdict(self.budget), "settings": asdict(self.settings)}))
+        if path.exists():
+            theirs = json.loads(path.read_text(encoding="utf-8"))
+            if theirs != ours:
+                raise InputError(f"{self.folder} holds runs of another budget or other settings, choose another folder")
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(path, ours)
+
+    # -------------------------------------------------------------- which runs there are
+
+    def instances(self, scene: str) -> range:
+        """The instances that are run."""
+        available = len(self.problem(scene).scene.task.instances)
+        return range(min(self.budget.instances or available, available))
+
+    def methods(self, scene: str) -> tuple[str, ...]:
+        """Methods of the main comparison, without tree-warm."""
+        return ("tree", *self.problem(scene).scene.task.sequences, "rand")
+
+    def main_runs(self, scene: str) -> list[Run]:
+        """Methods side by side, so that a change of the machine's speed meets all of them."""
+        return [
+            Run("main", scene, instance, method, seed, self.budget.seconds)
+            for seed in range(self.budget.seeds)
+            for instance in self.instances(scene)
+            for method in self.methods(scene)
+        ]
+
+    def warm_runs(self, scene: str) -> list[Run]:
+        return [
+            Run("warm", scene, instance, "tree-warm", seed, self.budget.seconds)
+            for seed in range(self.budget.seeds)
+            for instance in self.instances(scene)
+            if len(self.instances(scene)) > 1
+        ]
+
+    def reference_runs(self, scene: str) -> list[Run]:
+        return [
+            Run("reference", scene, instance, method, HELD_OUT, self.budget.seconds)
+            for instance in self.instances(scene)
+            for method in self.methods(scene)
+        ]
+
+    def sweep_runs(self, scene: str) -> list[Run]:
+        labels = [f"price={factor:g}" for factor in self.budget.prices]
+        labels += ["rollout", *(f"c_uct={c:g}" for c in self.budget.exploration)]
+        return [
+            Run("sweep", scene, instance, label, seed, self.budget.seconds)
+            for seed in range(self.budget.sweep_seeds)
+            for instance in self.sweep_instances(scene)
+            for label in labels
+        ]
+
+    def sweep_instances(self, scene: str) -> tuple[int, ...]:
+        """Instances of the sweep: spread over all."""
+        available = self.instances(scene)
+        return tuple(available)[:: max(1, len(available) // self.budget.sweep_instances)][: self.budget.sweep_instances]
+
+    def oracle_instances(self, scene: str) -> tuple[int, ...]:
+        return tuple(self.instances(scene))[: self.budget.oracle_instances]
+
+    def survey_runs(self, scene: str) -> list[Run]:
+        seconds = round(self.budget.survey_seconds_per_operator * len(self.problem(scene).transitions.problems()), 1)
+        return [Run("survey", scene, instance, "survey", 0, seconds) for instance in self.oracle_instances(scene)]
+
+    def fixed_runs(self, scene: str) -> list[Run]:
+        labels = [f"predicted {i + 1}" for i in range(self.budget.top)]
+        labels += [f"paper {i + 1}" for i in range(len(self._printed(scene).get("found", [])))]
+        return [
+            Run("fixed", scene, instance, label, seed, self.budget.seconds)
+            for seed in range(self.budget.top_seeds)
+            for instance in self.oracle_instances(scene)
+            for label in labels
+        ]
+
+    def operation_runs(self, scene: str) -> list[Run]:
+        sequences = dict.fromkeys(entry["sequence"] for entry in self._printed(scene).get("operations", []))
+        return [Run("operations", scene, 0, text, 0, self.budget.operation_seconds) for text in sequences]
+
+    def runs(self, scene: str) -> list[Run]:
+        """All runs of a scene in the order in which they are made."""
+        return [
+            *self.main_runs(scene),
+            *self.warm_runs(scene),
+            *self.reference_runs(scene),
+            *self.sweep_runs(scene),
+            *self.survey_runs(scene),
+            *self.fixed_runs(scene),
+            *self.operation_runs(scene),
+        ]
+
+    def _printed(self, scene: str) -> Mapping[str, Any]:
+        return self.paper.get(scene, {})
+
+    # -------------------------------------------------------------- running
+
+    def estimate(self) -> float:
+        """Seconds that the missing runs will take, compilation included."""
+        total = 0.0
+        for scene in self.scenes:
+            missing = [run for run in self.runs(scene) if not self.store.has(run)]
+            total += sum(run.seconds + RUN_OVERHEAD for run in missing) + (COMPILE_ESTIMATE if missing else 0.0)
+        return total
+
+    def execute(self) -> Iterator[Progress]:
+        """Makes the missing runs."""
+        self.claim_folder()
+        total, done = self.estimate(), 0.0
+        for scene in self.scenes:
+            missing = [run for run in self.runs(scene) if not self.store.has(run)]
+            if not missing:
+                continue
+            yield Progress(f"{scene}: compiling", done, total)
+            self._compile(scene)
+            done += COMPILE_ESTIMATE
+            for run in missing:
+                yield Progress(f"{scene} {run.instance}: {run.stage} {run.method}, seed {run.seed}", done, total)
+                self._execute(run)
+                done += run.seconds + RUN_OVERHEAD
+        yield Progress("done", total, total)
+
+    def _compile(self, scene: str) -> None:
+        """Programs of all instances; what the first process of a study needed is kept, later ones find it cached."""
+        path = self.folder / f"compile_{scene}.json"
+        known: set[str] = set()
+        programs: list[dict[str, Any]] = []
+        for instance in self.instances(scene):
+            for event in prepare(self.problem(scene, instance), self.settings):
+                # Programs are shared between instances; the same name and duration is the same program.
+                key = f"{event.name} {event.seconds}"
+                if key not in known:
+                    known.add(key)
+                    programs.append({"name": event.name, "seconds": event.seconds, "instance": instance})
+        if not path.exists():
+            write_json(path, programs)
+
+    def _execute(self, run: Run) -> None:
+        problem = self.problem(run.scene, run.instance)
+        transitions, settings = problem.transitions, self.settings
+        values = run.stage in ("main", "warm", "reference")
+        tree = run.method == "tree" or run.stage in ("warm", "survey")
+        chooser: Any
+        if run.stage in ("main", "reference"):
+            chooser = make_chooser(problem, run.method, run.seed)
+        elif run.stage == "warm":
+            chooser = make_chooser(problem, run.method, run.seed, self._prior(run))
+        elif run.stage == "sweep":
+            chooser = self._swept(run)
+        elif run.stage == "survey":
+            chooser = Survey(transitions)
+        elif run.stage == "fixed":
+            chooser = make_chooser(problem, self._sequence(run), run.seed)
+        else:
+            settings = SamplerSettings(tries=1, workers=1)
+            chooser = make_chooser(problem, run.method, run.seed)
+        self.store.write(run, execute(problem, chooser, run, settings, values, tree))
+
+    def _prior(self, run: Run) -> list[Mapping[str, Any]]:
+        """Trees of the other instances, same seed."""
+        others = [i for i in self.instances(run.scene) if i != run.instance]
+        runs = [Run("main", run.scene, i, "tree", run.seed, run.seconds) for i in others]
+        return [self.store.read(other).data["tree"] for other in runs]
+
+    def _swept(self, run: Run) -> Any:
+        transitions = self.problem(run.scene, run.instance).transitions
+        what, _, number = run.method.partition("=")
+        if what == "rollout":
+            return Tree(transitions, reward="rollout")
+        if what == "price":
+            return priced_tree(transitions, float(number))
+        return Tree(transitions, c_uct=float(number))
+
+    def _sequence(self, run: Run) -> str:
+        what, number = run.method.split()
+        if what == "paper":
+            return self._printed(run.scene)["found"][int(number) - 1]
+        ranked = self.ranking(run.scene, run.instance)
+        return self.problem(run.scene).transitions.format(ranked[min(int(number), len(ranked)) - 1][0])
+
+    def ranking(self, scene: str, instance: int) -> list[tuple[Path, float]]:
+        """Sequences by the rate that the operators' statistics of tree and survey predict."""
+        if (scene, instance) in self._rankings:
+            return self._rankings[scene, instance]
+        trees = [
+            self.store.read(run).data["tree"]
+            for run in [*self.main_runs(scene), *self.survey_runs(scene)]
+            if run.instance == instance and run.method in ("tree", "survey")
+        ]
+        merged = merged_tree(self.problem(scene, instance).transitions, trees)
+        ranked = self._rankings[scene, instance] = ranked_sequences(merged, self.settings.workers)
+        return ranked
+
+    # -------------------------------------------------------------- numbers
+
+    def numbers(self, scene: str) -> dict[str, Any]:
+        """Everything that tables and figures show of a scene, JSON-ready. All its runs must be there."""
+        problem = self.problem(scene)
+        task, transitions = problem.scene.task, problem.transitions
+        compiled = self.folder / f"compile_{scene}.json"
+        result: dict[str, Any] = {
+            "scene": scene,
+            "title": task.title,
+            "paper": dict(self._printed(scene)),
+            "budget": asdict(self.budget),
+            "sequences": dict(task.sequences),
+            "programs": json.loads(compiled.read_text(encoding="utf-8")) if compiled.exists() else [],
+            "times": measures.time_grid(self.budget.seconds).tolist(),
+            "instances": [self._instance(scene, instance) for instance in self.instances(scene)],
+            "sweep": self._sweep(scene),
+            "oracle": [self._oracle(scene, instance) for instance in self.oracle_instances(scene)],
+            "operations": self._operations(scene),
+        }
+        result["counts"] = self.counts(scene)
+        result["variables"] = [variable.name for variable in transitions.graph.variables]
+        return result
+
+    def counts(self, scene: str) -> dict[str, Any]:
+        """Table I and what lies behind it."""
+        transitions = self.problem(scene).transitions
+        return {
+            "complete": transitions.complete_count,
+            "pruned": transitions.pruned_count(),
+            "problems": len(transitions.problems()),
+            "sequences": transitions.count_sequences(),
+            "paper": self._printed(scene).get("counts"),
+        }
+
+    def _instance(self, scene: str, instance: int) -> dict[str, Any]:
+        budget = self.budget.seconds
+        times = measures.time_grid(budget)
+        problem = self.problem(scene, instance)
+        workers = self.settings.workers
+        methods: dict[str, dict[str, Any]] = {}
+        values: dict[str, list] = {}
+        for run in [*self.main_runs(scene), *self.warm_runs(scene)]:
+            if run.instance != instance:
+                continue
+            kept = self.store.read(run, values=True)
+            entry = methods.setdefault(
+                run.method,
+                {"final": [], "total": [], "rates": [], "first": [], "startup": [], "compile": [], "rejected": 0,
+                 "max_violation": 0.0, "focus": [], "best": []},
+            )
+            meta = kept.data["meta"]
+            entry["final"].append(measures.final_rate(kept.elapsed, budget))
+            entry["total"].append(len(kept.elapsed))
+            entry["rates"].append(measures.rate_over_time(kept.elapsed, times))
+            entry["first"].append(float(kept.elapsed.min()) if len(kept.elapsed) else None)
+            entry["startup"].append(meta["startup_seconds"])
+            entry["compile"].append(meta["compile_seconds"])
+            entry["rejected"] += meta["rejected_by_audit"]
+            entry["max_violation"] = max(entry["max_violation"], kept.data["max_violation"])
+            entry["best"].append(kept.data["best_sequences"][:1])
+            entry["focus"].append(_focus(problem, kept.data))
+            values.setdefault(run.method, []).append(kept.values)
+        for entry in methods.values():
+            rates = np.array(entry.pop("rates"))
+            entry["curve"] = np.round(rates.mean(axis=0), 2).tolist()
+        reference: dict[str, list] = {}
+        for run in self.reference_runs(scene):
+            if run.instance == instance:
+                for name, value in self.store.read(run, values=True).values.items():
+                    reference.setdefault(name, []).append(value)
+        kinds = {variable.name: variable.kind for variable in problem.graph.variables}
+        pooled = {name: np.concatenate(parts) for name, parts in reference.items()}
+        coverage = None
+        if min(map(len, (next(iter(v.values())) for v in values["tree"]))) and len(next(iter(pooled.values()))):
+            coverage = measures.coverage_of_instance(values, pooled, kinds, self.budget.coverage_least)
+        return {
+            "instance": instance,
+            "title": problem.scene.task.instances[instance].title,
+            "methods": methods,
+            "coverage": coverage,
+            "workers": workers,
+        }
+
+    def _sweep(self, scene: str) -> dict[str, Any]:
+        """Final rates by label and instance."""
+        rates: dict[str, dict[str, list[float]]] = {}
+        for run in self.sweep_runs(scene):
+            kept = self.store.read(run)
+            by_instance = rates.setdefault(run.method, {})
+            by_instance.setdefault(str(run.instance), []).append(measures.final_rate(kept.elapsed, run.seconds))
+        default = Tree(self.problem(scene).transitions).c_uct
+        return {"default_c_uct": default, "rates": rates}
+
+    def _oracle(self, scene: str, instance: int) -> dict[str, Any]:
+        transitions = self.problem(scene, instance).transitions
+        ranked = self.ranking(scene, instance)
+        predicted = {signature(path): rate for path, rate in ranked}
+        measured: dict[str, dict[str, Any]] = {}
+        runs = [run for run in self.fixed_runs(scene) if run.instance == instance]
+        runs += [
+            run
+            for run in self.main_runs(scene)
+            if run.instance == instance and run.method in self.problem(scene).scene.task.sequences
+        ]
+        for run in runs:
+            text = self.problem(scene).scene.task.sequences.get(run.method) or self._sequence(run)
+            entry = measured.setdefault(
+                run.method,
+                {
+                    "sequence": text,
+                    "predicted": predicted.get(signature(transitions.parse(text))),
+                    "final": [],
+                },
+            )
+            entry["final"].append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
+        rates = [rate for _, rate in ranked]
+        return {
+            "instance": instance,
+            "sequences": transitions.count_sequences(),
+            "distinct": len(ranked),
+            "predicted": [round(rate, 3) for rate in rates],
+            "best_predicted": [[transitions.format(path), rate] for path, rate in ranked[:5]],
+            "measured": measured,
+        }
+
+    def _operations(self, scene: str) -> list[dict[str, Any]]:
+        transitions = self.problem(scene).transitions
+        runs = {run.method: run for run in self.operation_runs(scene)}
+        result = []
+        for entry in self._printed(scene).get("operations", []):
+            data = self.store.read(runs[entry["sequence"]]).data
+            name = operation_name(transitions, entry["sequence"], entry["new"])
+            operator = data["operators"].get(name)
+            tries, successes = data["first_tries"].get(name, (0, 0))
+            result.append(
+                {
+                    **entry,
+                    "operator": name,
+                    "lanes": tries,
+                    "measured_microseconds": operator["microseconds_per_task"] if operator else None,
+                    "measured_success": successes / tries if tries else None,
+                }
+            )
+        return result
+
+    @cached_property
+    def all_numbers(self) -> dict[str, Any]:
+        """Numbers of every scene of the study, and the counts of all scenes that the paper's Table I has."""
+        return {
+            "scenes": {scene: self.numbers(scene) for scene in self.scenes},
+            "counts": {scene: self.counts(scene) for scene in self.paper},
+            "settings": asdict(self.settings),
+        }
+
+
+def _focus(problem: Problem, data: Mapping[str, Any]) -> float | None:
+    """Share of a run's device time that went into the operators of its best sequence; None without one."""
+    best = data["best_sequences"]
+    total = sum(operator["device_seconds"] for operator in data["operators"].values())
+    if not best or not total:
+        return None
+    names = {operator_text(transition) for transition in problem.transitions.parse(best[0][0])}
+    spent = sum(operator["device_seconds"] for name, operator in data["operators"].items() if name in names)
+    return spent / total

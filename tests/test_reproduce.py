@@ -1,0 +1,265 @@
+"""Experiments: measures against numbers known beforehand, and a whole study with made-up runs."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from paper_graphs import handover
+
+from cgs_jax.errors import InputError
+from cgs_jax.experiments import Budget, Study, claims, measures, runs, study, write_report
+from cgs_jax.transitions import Transitions
+from cgs_jax.uct import Tree
+
+ROOT = Path(__file__).parents[1]
+PAPER = tomllib.loads((ROOT / "scripts" / "reproduce.toml").read_text())["scenes"]
+
+
+# ------------------------------------------------------------------ measures
+
+
+def test_rates_of_a_steady_stream_are_its_rate():
+    elapsed = (np.arange(1000) + 0.5) / 100  # 100 per second for 10 s
+    times = measures.time_grid(10.0)
+    assert len(times) == 100 and times[-1] == 10.0
+    np.testing.assert_allclose(measures.rate_over_time(elapsed, times), 100.0, atol=1.01)
+    assert measures.final_rate(elapsed, 10.0) == 100.0
+
+
+def test_final_rate_counts_the_last_half_and_nothing_after_the_budget():
+    assert measures.final_rate(np.array([0.1, 4.9, 5.1, 9.9, 10.3]), 10.0) == pytest.approx(2 / 5)
+    assert measures.final_rate(np.zeros(0), 10.0) == 0.0
+
+
+def test_when_a_curve_gets_there():
+    times = np.array([1.0, 2.0, 3.0, 4.0])
+    assert measures.first_time_at(np.array([0.0, 5.0, 4.0, 5.0]), times, 5.0) == 2.0
+    assert measures.first_time_at(np.array([0.0, 5.0, 4.0, 5.0]), times, 6.0) is None
+    theirs = np.full(4, 3.0)
+    assert measures.time_of_overtaking(np.array([0.0, 5.0, 2.0, 5.0]), theirs, times) == 4.0
+    assert measures.time_of_overtaking(np.array([4.0, 5.0, 3.0, 5.0]), theirs, times) == 1.0
+    assert measures.time_of_overtaking(np.array([4.0, 5.0, 4.0, 2.0]), theirs, times) is None
+
+
+def test_ratio_with_nothing_below_is_no_ratio():
+    assert measures.ratio_with_interval([1.0, 2.0], [0.0, 0.0])["ratio"] is None
+    ratio = measures.ratio_with_interval([3.0, 3.2, 2.8], [1.0, 1.1, 0.9])
+    assert ratio["ratio"] == pytest.approx(3.0) and ratio["low"] < 3.0 < ratio["high"]
+
+
+def test_half_the_space_is_half_the_coverage():
+    random = np.random.default_rng(0)
+
+    def square(count, width):
+        return {"x": random.uniform([0, 0], [width, 1], (count, 2))}
+
+    values = {"tree": [square(3000, 1.0), square(3000, 1.0)], "half": [square(3000, 0.5)], "few": [square(10, 1.0)]}
+    result = measures.coverage_of_instance(values, square(6000, 1.0), {"x": "vector"}, least=50)
+    variable = result["variables"]["x"]
+    assert variable["fill_as_wanted"] and result["count"] == 3000
+    share = np.mean(variable["methods"]["half"]["cells_at_equal_time"])
+    share /= np.mean(variable["methods"]["tree"]["cells_at_equal_time"])
+    # Cells hold a few samples each: twice the density in half the space is more than half the cells, but not all.
+    assert 0.5 < share < 0.8
+    assert "cells_at_equal_count" not in variable["methods"]["few"]
+    (distance,) = variable["methods"]["half"]["radius_at_equal_time"]
+    assert distance == pytest.approx(0.5, abs=0.05)
+    ratios = measures.relative_to_tree([result], "x", "tree", "cells_at_equal_time")
+    assert np.mean(ratios) == pytest.approx(1.0) and len(ratios) == 2
+
+
+# ------------------------------------------------------------------ sequences
+
+
+def test_covering_sequences_use_every_operator():
+    transitions = Transitions(handover())
+    paths = runs.covering_sequences(transitions)
+    assert {t.problem for path in paths for t in path} == set(transitions.problems())
+    assert all(path[0].given == frozenset() and path[-1].target == transitions.full for path in paths)
+
+
+def test_survey_runs_all_its_sequences_and_skips_those_that_are_not_ready():
+    transitions = Transitions(handover())
+    survey = runs.Survey(transitions)
+    chosen = {survey.select() for _ in runs.covering_sequences(transitions)}
+    assert {t.problem for path in chosen for t in path} == set(transitions.problems())
+    assert survey.select(lambda transition: len(transition.new) == 7)[0].target == transitions.full
+    assert survey.select(lambda transition: False) == ()
+
+
+def test_ranking_finds_the_sequence_whose_operators_are_cheap():
+    transitions = Transitions(handover())
+    wanted = transitions.parse("t_a; q_a1; (q_a2,q_b2,p,t_b); q_b1")
+    cheap = runs.signature(wanted)
+    trees = []
+    for half in (0, 1):  # what two runs know together
+        tree = Tree(transitions)
+        for number, path in enumerate(runs.covering_sequences(transitions)):
+            for position, transition in enumerate(path):
+                if number % 2 == half:
+                    seconds = 0.001 if transition.problem in cheap else 1.0
+                    tree.record(path[:position], transition, 100, 80, seconds)
+        trees.append(tree.as_json())
+    merged = runs.merged_tree(transitions, trees)
+    ranked = runs.ranked_sequences(merged, workers=2)
+    assert runs.signature(ranked[0][0]) == cheap
+    assert ranked[0][1] == pytest.approx(2 * merged.predict_rate(wanted), rel=1e-6)
+    signatures = [runs.signature(path) for path, _ in ranked]
+    assert len(set(signatures)) == len(signatures) < transitions.count_sequences()
+    first = merged.operator_statistics()[wanted[0].problem]
+    assert first.visits == sum(
+        entry["visits"] for tree in trees for entry in tree["operators"] if tuple(entry["new"]) == ("t_a",)
+    )
+
+
+def test_operation_is_named_as_in_the_record():
+    transitions = Transitions(handover())
+    for entry in PAPER["handover"]["operations"]:
+        name = runs.operation_name(transitions, entry["sequence"], entry["new"])
+        assert name.split(" |")[0].strip("()").split(",") == list(
+            transitions.graph.ordered(entry["new"])
+        ) or set(name.split(" |")[0].strip("()").split(",")) == set(entry["new"])
+
+
+# ------------------------------------------------------------------ a whole study with made-up runs
+
+RATES = {"tree": 400.0, "tree-warm": 420.0, "expert1": 40.0, "expert2": 100.0, "expert3": 300.0, "rand": 20.0}
+BUDGET = Budget(
+    seconds=2.0, seeds=2, instances=2, coverage_least=20, sweep_instances=1, sweep_seeds=1, prices=(0.1, 1.0),
+    exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, top=2, top_seeds=1, operation_seconds=0.5,
+)  # fmt: skip
+
+
+def made_up(problem, chooser, run, settings=None, keep_values=False, keep_tree=False):
+    """A run that finds samples steadily, at the rate of its method and instance."""
+    random = np.random.default_rng([run.seed, run.instance, len(run.method)])
+    rate = RATES.get(run.method, 200.0) * (1.0 + run.instance)
+    elapsed = np.arange(1, int(rate * run.seconds) + 1) / rate
+    path = next(problem.transitions.sequences())
+    text = problem.transitions.format(path)
+    tree = Tree(problem.transitions)
+    for sequence in runs.covering_sequences(problem.transitions):
+        for position, transition in enumerate(sequence):
+            tree.record(sequence[:position], transition, 100, 50, 0.01 * len(transition.new))
+    operators, tries = {}, {}
+    for entry in PAPER["handover"]["operations"]:
+        if entry["sequence"] == run.method:
+            name = runs.operation_name(problem.transitions, entry["sequence"], entry["new"])
+            operators[name] = {"microseconds_per_task": 3.0 * len(entry["new"]), "device_seconds": 1.0}
+            tries[name] = [1000, 1000 - 100 * len(entry["new"])]
+    data = {
+        "meta": {"startup_seconds": 0.4, "compile_seconds": 7.0, "rejected_by_audit": 0},
+        "max_violation": 3e-5,
+        "sequences": {text: len(elapsed)},
+        "best_sequences": [[text, rate]],
+        "operators": operators,
+        "first_tries": tries,
+    }
+    if keep_tree:
+        data["tree"] = tree.as_json()
+    values = {}
+    for variable in problem.graph.variables if keep_values else ():
+        value = random.uniform(-1.0, 1.0, (len(elapsed), 7)).astype(np.float32)
+        if variable.kind == "pose":
+            value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
+        values[variable.name] = value
+    return runs.Kept(data, elapsed, values)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished study, and the runs that it made."""
+    made = []
+
+    def record(problem, chooser, run, *arguments, **named):
+        made.append(run)
+        return made_up(problem, chooser, run, *arguments, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "execute", record)
+        patch.setattr(study, "prepare", lambda problem, settings: iter(()))
+        whole = Study(tmp_path_factory.mktemp("study"), ["handover"], BUDGET, PAPER)
+        progress = list(whole.execute())
+        yield whole, made, progress
+
+
+def test_study_makes_every_run_once_and_goes_on_where_it_stopped(finished):
+    whole, made, progress = finished
+    assert made == whole.runs("handover") and len(set(made)) == len(made)
+    assert progress[-1].done == progress[-1].total and [p.done for p in progress] == sorted(p.done for p in progress)
+    lost = next(run for run in made if run.stage == "sweep")
+    (whole.store.folder / f"{lost.key}.json").unlink()
+    count = len(made)
+    list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
+    assert made[count:] == [lost]
+    del made[count:]
+    assert whole.estimate() == 0.0
+
+
+def test_folder_of_another_budget_is_refused(finished):
+    whole, _, _ = finished
+    other = Study(whole.folder, ["handover"], Budget(seconds=3.0, seeds=1), PAPER)
+    with pytest.raises(InputError, match="another folder"):
+        other.claim_folder()
+
+
+def test_warm_start_leaves_the_own_instance_out(finished):
+    whole, made, _ = finished
+    run = next(run for run in made if run.stage == "warm" and run.instance == 1)
+    (prior,) = whole._prior(run)
+    (other,) = [r for r in made if r.stage == "main" and r.method == "tree" and (r.instance, r.seed) == (0, run.seed)]
+    assert prior == whole.store.read(other).data["tree"]
+
+
+def test_report_has_every_table_and_figure(finished):
+    whole, _, _ = finished
+    path = write_report(whole, "python scripts/reproduce.py")
+    text = path.read_text()
+    for title in ("Claims", "Table I", "Table II", "Operations", "Sample rates", "Compile time", "Warm start", "Coverage"):
+        assert title in text
+    assert "| handover | 2059 | 2059 | 163 | 163 |" in text
+    assert "| banana | 19171 | 19171 | 534 | 534 |" in text
+    for line in text.splitlines():
+        if line.startswith("!["):
+            figure = whole.folder / line.split("(")[1].rstrip(")")
+            assert figure.read_bytes().startswith(b"\x89PNG") and figure.stat().st_size > 10_000
+    assert text.count("![") == 5
+    results = json.loads((whole.folder / "results.json").read_text())
+    assert results["scenes"]["handover"]["instances"][1]["methods"]["tree"]["final"] == [800.0, 800.0]
+
+
+def test_claims_are_confronted_with_the_numbers(finished):
+    whole, _, _ = finished
+    numbers = json.loads(json.dumps(whole.all_numbers))
+    by_text = {claim.text: claim for claim in claims.confront(numbers)}
+
+    def claim(words):
+        (found,) = [claim for text, claim in by_text.items() if words in text]
+        return found
+
+    assert claim("Table I").passed
+    assert claim("0.95 of the best expert").passed and claim("1.3 of the best expert").passed  # 400 over 300
+    assert claim("Tree beats rand").passed and claim("passed the audit").passed
+    assert claim("within 2 s").passed
+    assert not claim("starts below").passed  # made-up trees are fast from the start
+    assert not claim("more sensitive").passed  # all rates double on the second instance
+    for instance in numbers["scenes"]["handover"]["instances"]:
+        instance["methods"]["tree"]["final"] = [90.0, 80.0]
+        instance["methods"]["tree"]["max_violation"] = 2e-4
+    by_text = {claim.text: claim for claim in claims.confront(numbers)}
+    assert claim("0.95 of the best expert").passed is False and "handover 1" in claim("0.95 of the best expert").reason
+    assert claim("fixed sequence's, found by any means").passed is False
+    assert claim("passed the audit").passed is False
+
+
+def test_command_refuses_bad_numbers_in_one_line(tmp_path):
+    command = [sys.executable, str(ROOT / "scripts" / "reproduce.py"), "--seeds", "0", "--out", str(tmp_path / "out")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "--seeds" in done.stderr
+    assert not (tmp_path / "out").exists()
