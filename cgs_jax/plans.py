@@ -41,10 +41,10 @@ from cgs_jax.poses import Array, Pose, cross, matmul, matvec, retract, transpose
 
 
 class FunctionSlot(NamedTuple):
-    """A user's function and where its arguments are: ("configuration", position) or ("word", position)."""
+    """A user's function and where its arguments are: ("configuration", position, joints) or ("word", position, 7)."""
 
     function: Function
-    arguments: tuple[tuple[str, int], ...]
+    arguments: tuple[tuple[str, int, int], ...]
     constraint: int
 
 
@@ -104,8 +104,8 @@ class Layout:
 
     @property
     def solves(self) -> bool:
-        """Whether there is anything to solve: without, drawing the free poses is all."""
-        return bool(self.configurations or self.functions) or self.words > self.free
+        """Whether there is anything to solve: without, drawing the free poses is all (and judging what is defined)."""
+        return bool(self.unknowns) and (bool(self.configurations or self.functions) or self.words > self.free)
 
 
 class Words(NamedTuple):
@@ -341,7 +341,7 @@ class _Assembler:
             words=words,
             given=first_tool - self.sites - 1,
             sites=self.sites,
-            length=_rounded(max(len(product) for product in products + outputs), 12),
+            length=_rounded(max([len(product) for product in products + outputs], default=1), 12),
             tool_places=_rounded(len(of_configurations), 2 * words) if self.order else 0,
             free_places=_rounded(len(of_free), words) if self.free else 0,
             constraints=_rounded(len(constraints), 16),
@@ -380,11 +380,12 @@ class _Assembler:
         scopes = [v for f in self.functions.values() for v in f.scope]
         return list(dict.fromkeys(v for v in scopes if self.dofs[v] is not None and v not in self.order))
 
-    def _argument(self, variable: str) -> tuple[str, int]:
-        if self.dofs[variable] is None:
+    def _argument(self, variable: str) -> tuple[str, int, int]:
+        dof = self.dofs[variable]
+        if dof is None:
             own = len(self.words) - len(self.read_by_functions)
-            return "word", own + list(self.read_by_functions).index(variable)
-        return "configuration", [*self.order, *self._function_configurations()].index(variable)
+            return "word", own + list(self.read_by_functions).index(variable), 7
+        return "configuration", [*self.order, *self._function_configurations()].index(variable), dof
 
     def _seed_of(self, pose: str) -> str | None:
         """The constraint on a free pose alone that its seed is drawn from."""
@@ -613,15 +614,16 @@ class PlanSystem:
     ) -> dict[str, FunctionArgument]:
         layout = self.layout
         arguments = {}
-        for name, (kind, at) in zip(slot.function.scope, slot.arguments, strict=True):
+        for name, (kind, at, size) in zip(slot.function.scope, slot.arguments, strict=True):
             if kind == "word":
                 pose = Pose(prefixes.whole.rotation[:, :, at], prefixes.whole.position[:, at])
                 arguments[name] = FunctionArgument(pose, None if tangents is None else tangents[at])
             elif at >= layout.configurations:
                 arguments[name] = FunctionArgument(tasks.configurations[at - layout.configurations], None)
             else:
-                identity = jnp.eye(layout.joints, layout.unknowns, at * layout.joints)[..., None]
-                arguments[name] = FunctionArgument(x.configurations[at], identity)
+                # Robots with fewer joints than the longest are padded.
+                identity = jnp.eye(size, layout.unknowns, at * layout.joints)[..., None]
+                arguments[name] = FunctionArgument(x.configurations[at, :size], identity)
         return arguments
 
     def room(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, jax.Array]:
