@@ -18,6 +18,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cgs_jax
+from cgs_jax.programs import end_process
+
 SCENES = ("handover", "banana")
 
 
@@ -36,7 +39,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     logging.disable(logging.WARNING)  # importing mjx warns that warp is not installed
 
-    import cgs_jax
     from cgs_jax.experiments import FULL, QUICK, Study, write_report
 
     for name in ("seconds", "seeds", "instances"):
@@ -79,4 +81,8 @@ def run(study) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # After Ctrl-C, programs may still be waiting to be compiled: a normal exit would wait for them.
+    end_process(status)

@@ -62,11 +62,16 @@ def text(numbers: Mapping[str, Any], confronted: Sequence[claims.Claim], command
     return "\n\n".join(parts) + "\n"
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A Markdown table; the first column is left aligned, the others right."""
-    lines = ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
-    lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]], texts: int = 1) -> str:
+    """A Markdown table; the first `texts` columns are left aligned, the others right."""
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * texts + " ---: |" * (len(head) - texts)]
+    lines += ["| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join(lines)
+
+
+def listed(numbers: Sequence[int], what: str) -> str:
+    """For instance "instances 0, 2"."""
+    return f"{what}{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
 def number(value: float | None) -> str:
@@ -86,9 +91,8 @@ def ratio(entry: Mapping[str, float | None]) -> str:
 
 def _claims(confronted: Sequence[claims.Claim]) -> str:
     words = {True: "yes", False: "**no**", None: "not told"}
-    lines = ["| Claim | From | Holds | Measured |", "| --- | --- | --- | --- |"]
-    lines += [f"| {c.text} | {c.source} | {words[c.passed]} | {c.reason} |" for c in confronted]
-    return "\n".join(lines)
+    rows = [[claim.text, claim.source, words[claim.passed], claim.reason] for claim in confronted]
+    return table(["Claim", "From", "Holds", "Measured"], rows, texts=4)
 
 
 def _counts(counts: Mapping[str, Any]) -> str:
@@ -110,7 +114,7 @@ def _sequences(scene: Mapping[str, Any]) -> str:
         value = number(float(np.mean(rates))) if rates else "–"
         rows.append([f"{scene['scene']}: {name}", f"`{sequence}`" if sequence else "", value, where])
 
-    everywhere = f"{len(scene['instances'])} instances"
+    everywhere = f"all {len(scene['instances'])} instances run"
     for name, sequence in scene["sequences"].items():
         row(name, sequence, [r for i in scene["instances"] for r in claims.finals(i, name)], everywhere)
     row("rand", "", [r for i in scene["instances"] for r in claims.finals(i, "rand")], everywhere)
@@ -119,24 +123,24 @@ def _sequences(scene: Mapping[str, Any]) -> str:
         label = f"paper {position + 1}"
         entries = [o["measured"][label] for o in scene["oracle"] if label in o["measured"]]
         rates = [rate for entry in entries for rate in entry["final"]]
-        row("found by the paper's tree", sequence, rates, f"{len(entries)} instances")
+        row("found by the paper's tree", sequence, rates, listed([o["instance"] for o in scene["oracle"]], "instance"))
+    fixed: dict[str, list[tuple[int, float]]] = {}
     for entry in claims.oracle_ratios(scene):
-        measured = [entry["rate"]]
-        where = f"instance {entry['instance']}"
-        row(f"best fixed sequence run, {entry['label']}", entry["sequence"], measured, where)
+        fixed.setdefault(entry["sequence"], []).append((entry["instance"], entry["rate"]))
+    for sequence, found in fixed.items():
+        where = listed([instance for instance, _ in found], "instance")
+        row("best of all fixed sequences run", sequence, [rate for _, rate in found], where)
+    by_tree: dict[str, list[tuple[int, float]]] = {}
     for instance in scene["instances"]:
         best = [seed[0] for seed in instance["methods"]["tree"]["best"] if seed]
         if best:
-            sequence, predicted = max(best, key=lambda pair: pair[1])
-            rows.append(
-                [
-                    f"{scene['scene']}: best found by tree",
-                    f"`{sequence}`",
-                    f"{number(predicted)} (predicted)",
-                    f"instance {instance['instance']}",
-                ]
-            )
-    return table(["", "sequence", "final samples/s", "mean over"], rows)
+            sequence, _ = max(best, key=lambda pair: pair[1])
+            rate = float(np.mean(claims.finals(instance, "tree")))
+            by_tree.setdefault(sequence, []).append((instance["instance"], rate))
+    for sequence, found in by_tree.items():
+        where = listed([instance for instance, _ in found], "instance")
+        row("best found by tree (rate: tree's)", sequence, [rate for _, rate in found], where)
+    return table(["", "sequence", "final samples/s", "mean over"], rows, texts=2)
 
 
 def _operations(scene: Mapping[str, Any]) -> str:
@@ -157,7 +161,7 @@ def _operations(scene: Mapping[str, Any]) -> str:
         f"{scene['scene']}, first instance; one worker, one try per lane, clearance included. Conditions are those that "
         "the rest of the sequence makes. Which variables the paper's pick and place has is not printed."
     )
-    return table(head, rows) + "\n\n" + note
+    return table(head, rows, texts=2) + "\n\n" + note
 
 
 def _scene(scene: Mapping[str, Any]) -> list[str]:

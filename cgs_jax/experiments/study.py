@@ -40,7 +40,7 @@ from cgs_jax.uct import Path, Tree
 RUN_OVERHEAD = 0.8
 """Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
 
-COMPILE_ESTIMATE = 45.0
+COMPILE_ESTIMATE = 70.0
 """Seconds to compile a scene's programs on two cores; for the estimate."""
 
 HELD_OUT = 1000
@@ -67,7 +67,7 @@ class Budget:
 
 
 QUICK = Budget(
-    seconds=4.0,
+    seconds=3.0,
     seeds=2,
     instances=2,
     coverage_least=50,
