@@ -70,11 +70,16 @@ def site_poses(model, home, joints, base, site, q):
     return np.array(rotations), np.array(positions)
 
 
+TOOL = jax.jit(lambda chain, q: tool_pose(chain, joint_frames(chain, q)))
+
+
 def evaluate(chain, q):
     """Tools of `(lanes, n)` as `(lanes, 3, 3)`, `(lanes, 3)`."""
-    tool = tool_pose(chain, joint_frames(chain, jnp.asarray(q[:, : len(chain.hinge)].T, jnp.float32)))
+    tool = TOOL(chain, jnp.asarray(q[:, : len(chain.hinge)].T, jnp.float32))
     lanes = len(q)
-    return np.moveaxis(np.broadcast_to(tool.rotation, (3, 3, lanes)), 2, 0), np.broadcast_to(tool.position, (3, lanes)).T
+    return np.moveaxis(np.broadcast_to(tool.rotation, (3, 3, lanes)), 2, 0), np.broadcast_to(
+        tool.position, (3, lanes)
+    ).T
 
 
 CHAINS = [(name, key) for name in SCENES for key in problem(name).exact.chains]
@@ -86,7 +91,9 @@ def test_chains_of_the_scenes_agree_with_mujoco(name, key):
     robot = at.scene.task.robot(key.split("/")[0])
     frame = key.split("/")[1]
     chain = at.exact.chains[key]
-    limits = next(at.params.limits[v] for s in at.scene.task.switches for r, v in s.configurations.items() if r == robot.name)
+    limits = next(
+        at.params.limits[v] for s in at.scene.task.switches for r, v in s.configurations.items() if r == robot.name
+    )
     q = np.random.default_rng(0).uniform(*limits, size=(20, len(robot.joints)))
     rotation, position = site_poses(at.scene.model, at.scene.home_qpos, robot.joints, robot.base, frame, q)
     on_host = tool_poses_on_host(chain, q)
@@ -181,12 +188,17 @@ def numeric_jacobian(chain, q, h=1e-6):
     return np.array(columns).T
 
 
+@jax.jit
+def jacobian_at(chain, q):
+    frames = joint_frames(chain, q)
+    return tool_jacobian(chain, frames, tool_pose(chain, frames))
+
+
 def test_jacobians_agree_with_finite_differences(odd):
     chains = [odd[2].chain("tip")] + [problem(name).exact.chains[key] for name, key in CHAINS]
     for chain in chains:
         q = np.random.default_rng(5).uniform(-2, 2, size=(3, len(chain.hinge)))
-        frames = joint_frames(chain, jnp.asarray(q.T, jnp.float32))
-        ours = np.asarray(tool_jacobian(chain, frames, tool_pose(chain, frames)))
+        ours = np.asarray(jacobian_at(chain, jnp.asarray(q.T, jnp.float32)))
         for lane in range(3):
             np.testing.assert_allclose(ours[:, :, lane], numeric_jacobian(chain, q[lane]), atol=5e-6)
 
@@ -197,8 +209,7 @@ def test_padding_changes_nothing(odd):
     longer = np.concatenate([q, np.full((5, 2), 0.3)], axis=1)
     for ours, theirs in zip(evaluate(padded(chain, 5), longer), evaluate(chain, q), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
-    frames = joint_frames(padded(chain, 5), jnp.asarray(longer.T, jnp.float32))
-    jacobian = tool_jacobian(padded(chain, 5), frames, tool_pose(padded(chain, 5), frames))
+    jacobian = jacobian_at(padded(chain, 5), jnp.asarray(longer.T, jnp.float32))
     np.testing.assert_array_equal(jacobian[:, 3:], 0)
 
 
