@@ -131,7 +131,8 @@ def test_operation_is_named_as_in_the_record():
 RATES = {"tree": 400.0, "tree-warm": 420.0, "expert1": 40.0, "expert2": 100.0, "expert3": 300.0, "rand": 20.0}
 BUDGET = Budget(
     seconds=2.0, seeds=2, instances=2, coverage_least=20, sweep_instances=1, sweep_seeds=1, prices=(0.1, 1.0),
-    exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, top=2, top_seeds=1, operation_seconds=0.5,
+    exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, screened=3, screen_seconds=0.5,
+    top=2, top_seeds=1, operation_seconds=0.5,
 )  # fmt: skip
 
 

@@ -148,6 +148,8 @@ def coverage(scene: Mapping[str, Any], path: Path) -> None:
                     x = at - 0.4 + (number + 0.5) * width
                     axis.bar(x, value["mean"], width * 0.92, color=colour, alpha=0.9)
                     axis.plot([x, x], [value["low"], value["high"]], color="black", lw=0.9)
+            if not axis.patches:
+                axis.text(0.5, 0.5, "tree has too few samples", transform=axis.transAxes, ha="center", color="#555555")
             axis.axhline(1.0, color=COLOURS["tree"], lw=0.9, ls=":")
             axis.grid(axis="x", visible=False)
             axis.set(title=title, ylabel="over tree's")
@@ -234,10 +236,14 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
             left.plot(np.arange(1, len(predicted) + 1), predicted, color=colour, lw=1.5, label=label)
             tree = float(np.mean(finals(by_number[entry["instance"]], "tree")))
             left.plot([0.85], [tree], ">", color=colour, ms=6, clip_on=False)
+            for tried in entry["screened"]:
+                if tried["predicted"] and tried["rate"] > 0:
+                    points.append((tried["predicted"], tried["rate"]))
+                    right.plot(tried["predicted"], tried["rate"], ".", color=colour, ms=4, alpha=0.5)
             for label, measured in entry["measured"].items():
                 real = float(np.mean(measured["final"]))
                 if measured["predicted"] and real > 0:
-                    marker = "o" if label.startswith("predicted") else "s" if label.startswith("paper") else "^"
+                    marker = "o" if label.startswith("screened") else "s" if label.startswith("paper") else "^"
                     points.append((measured["predicted"], real))
                     right.plot(measured["predicted"], real, marker, color=colour, ms=5, alpha=0.85)
         left.set_xscale("log")
@@ -252,7 +258,7 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
         if points:
             low, high = np.min(points), np.max(points)
             right.plot([low, high], [low, high], color="#999999", lw=0.9, ls=":")
-        for marker, label in (("o", "best predicted"), ("s", "found in the paper"), ("^", "experts")):
+        for marker, label in ((".", "screened shortly"), ("o", "best of these"), ("s", "found in the paper"), ("^", "experts")):
             right.plot([], [], marker, color="#555555", label=label)
         right.set_xscale("log")
         right.set_yscale("log")

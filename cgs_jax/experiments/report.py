@@ -152,14 +152,18 @@ def _operations(scene: Mapping[str, Any]) -> str:
             number(1e3 * entry["milliseconds"]),
             "–" if entry["measured_success"] is None else f"{100 * entry['measured_success']:.0f} %",
             f"{100 * entry['success']:.0f} %",
+            "–" if entry["condition_feasible"] is None else f"{100 * entry['condition_feasible']:.0f} %",
+            "–" if entry["solver_success"] is None else f"{100 * entry['solver_success']:.0f} %",
             entry["lanes"],
         ]
         for entry in scene["operations"]
     ]
-    head = ["Operation", "operator", "µs per lane", "paper, µs", "success", "paper", "lanes"]
+    head = ["Operation", "operator", "µs per lane", "paper, µs", "success", "paper"]
+    head += ["condition feasible", "success where feasible", "lanes"]
     note = (
-        f"{scene['scene']}, first instance; one worker, one try per lane, clearance included. Conditions are those that "
-        "the rest of the sequence makes. Which variables the paper's pick and place has is not printed."
+        f"{scene['scene']}, first instance; one worker, clearance included; success of each lane's first try. Conditions "
+        "are those that the sequence makes, some of which admit no solution: second tries of failed conditions tell "
+        "the two factors of the paper's Eq. 2 apart. Which variables the paper's pick and place has is not printed."
     )
     return table(head, rows, texts=2) + "\n\n" + note
 
@@ -320,16 +324,24 @@ def _oracle(scene: Mapping[str, Any]) -> str:
                 entry["label"],
                 number(entry["predicted"]),
                 number(entry["rate"]),
+                _trust(oracle["screened"]),
                 ratio(entry),
             ]
         )
-    head = ["Instance", "distinct of all", "best fixed sequence run", "chosen as", "predicted", "measured", "tree over it"]
+    head = ["Instance", "distinct of all", "best fixed sequence run", "chosen as"]
+    head += ["predicted", "measured", "trust", "tree over it"]
     note = (
         "Rates of all complete sequences are predicted from the operators' statistics (tree and survey); of sequences "
-        "that differ only in the order of independent operators one is kept. The best predicted ones, the experts and the "
-        "sequences that the paper found are run with the same pools and retries; the last column is the tree's regret."
+        "that differ only in the order of independent operators one is kept. The best predicted ones are screened shortly; "
+        "the best of these, the experts and the sequences that the paper found are run with the same pools and retries; "
+        "the last column is the tree's regret. *Trust*: measured over predicted rate of the screened ones, median."
     )
     return table(head, rows) + "\n\n" + note
+
+
+def _trust(screened: Sequence[Mapping[str, Any]]) -> str:
+    shares = [entry["rate"] / entry["predicted"] for entry in screened if entry["predicted"]]
+    return number(float(np.median(shares))) if shares else "–"
 
 
 def _machine() -> str:

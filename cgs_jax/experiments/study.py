@@ -2,8 +2,8 @@
 
 Stages, in order. compile: all programs. main: tree, the experts, rand. warm: tree with the statistics of the other
 instances. reference: held-out samples for coverage. sweep: price of time and exploration constant. survey: every
-operator. fixed: the sequences that the operators' statistics predict to be best, and those that the paper found, run.
-operations: single conditional operators, one try per lane.
+operator. screen: the sequences that the operators' statistics predict to be best, shortly. fixed: those that were best
+there, and those that the paper found, as long as the main runs. operations: single conditional operators.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ class Budget:
     exploration: tuple[float, ...] = (0.003, 0.01, 0.1, 0.3, 1.0)
     oracle_instances: int | None = None
     survey_seconds_per_operator: float = 0.4
-    top: int = 4
+    screened: int = 24
+    screen_seconds: float = 1.5
+    top: int = 3
     top_seeds: int = 2
     operation_seconds: float = 4.0
 
@@ -77,7 +79,9 @@ QUICK = Budget(
     exploration=(0.003, 0.3),
     oracle_instances=1,
     survey_seconds_per_operator=0.2,
-    top=3,
+    screened=8,
+    screen_seconds=1.0,
+    top=2,
     top_seeds=1,
     operation_seconds=2.0,
 )
@@ -186,8 +190,15 @@ class Study:
         seconds = round(self.budget.survey_seconds_per_operator * len(self.problem(scene).transitions.problems()), 1)
         return [Run("survey", scene, instance, "survey", 0, seconds) for instance in self.oracle_instances(scene)]
 
+    def screen_runs(self, scene: str) -> list[Run]:
+        return [
+            Run("screen", scene, instance, f"predicted {i + 1}", 0, self.budget.screen_seconds)
+            for instance in self.oracle_instances(scene)
+            for i in range(self.budget.screened)
+        ]
+
     def fixed_runs(self, scene: str) -> list[Run]:
-        labels = [f"predicted {i + 1}" for i in range(self.budget.top)]
+        labels = [f"screened {i + 1}" for i in range(self.budget.top)]
         labels += [f"paper {i + 1}" for i in range(len(self._printed(scene).get("found", [])))]
         return [
             Run("fixed", scene, instance, label, seed, self.budget.seconds)
@@ -208,6 +219,7 @@ class Study:
             *self.reference_runs(scene),
             *self.sweep_runs(scene),
             *self.survey_runs(scene),
+            *self.screen_runs(scene),
             *self.fixed_runs(scene),
             *self.operation_runs(scene),
         ]
@@ -271,10 +283,11 @@ class Study:
             chooser = self._swept(run)
         elif run.stage == "survey":
             chooser = Survey(transitions)
-        elif run.stage == "fixed":
+        elif run.stage in ("screen", "fixed"):
             chooser = make_chooser(problem, self._sequence(run), run.seed)
         else:
-            settings = SamplerSettings(tries=1, workers=1)
+            # Second tries tell conditions that cannot be met from failures of the solver; first tries are counted apart.
+            settings = SamplerSettings(tries=2, workers=1)
             chooser = make_chooser(problem, run.method, run.seed)
         self.store.write(run, execute(problem, chooser, run, settings, values, tree))
 
@@ -297,8 +310,16 @@ class Study:
         what, number = run.method.split()
         if what == "paper":
             return self._printed(run.scene)["found"][int(number) - 1]
+        if what == "screened":
+            return self.screened(run.scene, run.instance)[int(number) - 1][0]
         ranked = self.ranking(run.scene, run.instance)
         return self.problem(run.scene).transitions.format(ranked[min(int(number), len(ranked)) - 1][0])
+
+    def screened(self, scene: str, instance: int) -> list[tuple[str, float]]:
+        """Screened sequences with their measured rates, best first."""
+        runs = [run for run in self.screen_runs(scene) if run.instance == instance]
+        rates = [measures.final_rate(self.store.read(run).elapsed, run.seconds) for run in runs]
+        return sorted(zip(map(self._sequence, runs), rates, strict=True), key=lambda entry: -entry[1])
 
     def ranking(self, scene: str, instance: int) -> list[tuple[Path, float]]:
         """Sequences by the rate that the operators' statistics of tree and survey predict."""
@@ -430,7 +451,12 @@ class Study:
             )
             entry["final"].append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
         rates = [rate for _, rate in ranked]
+        screened = [
+            {"sequence": text, "predicted": predicted.get(signature(transitions.parse(text))), "rate": rate}
+            for text, rate in self.screened(scene, instance)
+        ]
         return {
+            "screened": screened,
             "instance": instance,
             "sequences": transitions.count_sequences(),
             "distinct": len(ranked),
@@ -455,6 +481,8 @@ class Study:
                     "lanes": tries,
                     "measured_microseconds": operator["microseconds_per_task"] if operator else None,
                     "measured_success": successes / tries if tries else None,
+                    "condition_feasible": operator.get("condition_feasible") if operator else None,
+                    "solver_success": operator.get("solver_success_if_feasible") if operator else None,
                 }
             )
         return result
