@@ -1,7 +1,7 @@
 """Run the paper's experiments on this machine and write a report beside the printed numbers.
 
-    python scripts/reproduce.py --scene handover --quick --out results
-    python scripts/reproduce.py --out results
+    python scripts/reproduce.py --scene handover --quick
+    python scripts/reproduce.py --out runs/reproduce
 
 Finished runs are kept in the folder and skipped: after an interruption, give the same command again.
 Exit status: 0, 2 for bad input, 130 after Ctrl-C.
@@ -28,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description="Run the paper's experiments and write a report.")
     parser.add_argument("--scene", choices=(*SCENES, "all"), default="all", help="which scene (default all)")
     parser.add_argument("--quick", action="store_true", help="few instances and short runs: at most 10 minutes")
-    parser.add_argument("--out", type=Path, default=Path("results"), metavar="DIR", help="folder (default results)")
+    parser.add_argument("--out", type=Path, default=Path("runs/reproduce"), metavar="DIR", help="folder (default runs/reproduce)")
     parser.add_argument("--seconds", type=float, metavar="S", help="sampling time of each run")
     parser.add_argument("--seeds", type=int, metavar="N", help="seeds of the main comparison")
     parser.add_argument("--instances", type=int, metavar="N", help="only the first N instances")
