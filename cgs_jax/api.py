@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -178,6 +179,8 @@ def operator(
         count = lanes if lanes is not None else next((len(value) for value in read.values()), None)
         if count is None:
             raise InputError(f"operator for {', '.join(bound.new)} reads no variable: say how many lanes")
+        for name, value in read.items():
+            chex.assert_shape(value, (count, problem.dofs[name] or 7))
         arguments = gather_given(bound, params, read, count)
         of_function = tuple(read[name] for name in bound.plan.given_configurations)
         proposals = propose(
