@@ -93,7 +93,7 @@ class Measured:
     """The same from the moment the first operators were ready; the tree still knows nothing then."""
     startup_seconds: float
     cpu_share: float
-    """Processor time inside the window over window and cores."""
+    """Processor time of this process and its workers from the window's begin to the run's end, over that time and cores."""
     record: Recorder
     transitions: dict[str, Transition]
     """By the operator's text in the record."""
@@ -129,8 +129,8 @@ def measure(
         elif isinstance(event, Found) and low <= event.elapsed < high:
             found_inside += len(event.qpos)
         if began and not cpu[0] and time.perf_counter() - began >= low:
-            cpu = (time.perf_counter(), time.process_time())
-    wall, busy = time.perf_counter() - cpu[0], time.process_time() - cpu[1]
+            cpu = (time.perf_counter(), processor_seconds())
+    wall, busy = time.perf_counter() - cpu[0], processor_seconds() - cpu[1]
     return Measured(
         rate=found_inside / (high - low),
         rate_from_start=record.count / high,
@@ -139,6 +139,18 @@ def measure(
         record=record,
         transitions=transitions,
     )
+
+
+def processor_seconds() -> float:
+    """Processor time so far of this process and of those that it started (those still alive: Linux only)."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    total = time.process_time() + ended.ru_utime + ended.ru_stime
+    for thread in Path("/proc/self/task").glob("*"):
+        with contextlib.suppress(OSError, ValueError):
+            for child in (thread / "children").read_text().split():
+                fields = Path("/proc", child, "stat").read_text().rpartition(")")[2].split()
+                total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def warm_up(problem: Problem, method: str = "tree", settings: SamplerSettings | None = None) -> dict[str, float]:
@@ -462,7 +474,7 @@ def utilisation(given: argparse.Namespace) -> dict[str, Any]:
             "float operations of the solver's step as written, counted by evaluating its jaxpr with loops followed; "
             "seeds, clearance and audit are not counted"
         ),
-        "peak_flops": peak_flops(),
+        "peak_flops": peak_of_machine(),
         "peak_from": "float32 matrix products 2048 x 2048, all cores, the faster of jax and numpy",
         "instance": given.instances[0],
         "scenes": {},
@@ -715,6 +727,14 @@ def operations(name: str, parameters: Mapping[str, Any], equation: Any) -> int:
     return int(np.prod(result.shape)) if name in SINGLE_OPERATIONS else 0
 
 
+def peak_of_machine() -> float:
+    """`peak_flops` in a process of its own, which may use all cores whatever the sampler has set for itself."""
+    held = ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {name: value for name, value in os.environ.items() if name not in held}
+    command = [sys.executable, str(Path(__file__).resolve()), "--worker", "peak"]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout)
+
+
 def peak_flops(size: int = 2048, seconds: float = 1.0) -> float:
     """Float operations per second of a plain float32 matrix product on all cores, the best of what jax and numpy reach."""
     import jax
@@ -734,10 +754,11 @@ def peak_flops(size: int = 2048, seconds: float = 1.0) -> float:
     return best
 
 
-def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes."""
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return used if sys.platform == "darwin" else 1024 * used
+def peak_memory() -> dict[str, int]:
+    """Largest resident size so far, bytes: of this process, and of the largest process that it started and that ended."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    who = {"process": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
+    return {name: unit * resource.getrusage(whose).ru_maxrss for name, whose in who.items()}
 
 
 def utilisation_tables(report: Mapping[str, Any]) -> list[Table]:
@@ -759,7 +780,7 @@ def utilisation_tables(report: Mapping[str, Any]) -> list[Table]:
             f"{entry['share_of_peak']:.3f}",
             "none" if per_sample is None else f"{per_sample / 1e6:.2f}",
             f"{entry['cpu_share']:.2f}",
-            number(entry["peak_memory_bytes"] / 1e6),
+            " + ".join(number(size / 1e6) for size in entry["peak_memory_bytes"].values()),
         )
         for name, row in entry["operators"].items():
             operators.add_row(
@@ -1249,6 +1270,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Exit status 0, 1 when slower than `--against`, or 2 for bad input (one line)."""
     given = parse().parse_args(arguments)
     try:
+        if given.worker == "peak":
+            print(peak_flops())
+            return 0
         if given.worker:
             scene, _, instance = given.worker.rpartition(",")
             print(json.dumps(compile_while_sampling(scene, int(instance))))
