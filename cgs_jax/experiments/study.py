@@ -37,11 +37,11 @@ from cgs_jax.record import operator_text, write_json
 from cgs_jax.sampler import SamplerSettings
 from cgs_jax.uct import Path, Tree
 
-RUN_OVERHEAD = 0.8
+RUN_OVERHEAD = 0.5
 """Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
 
-COMPILE_ESTIMATE = 70.0
-"""Seconds to compile a scene's programs on two cores; for the estimate."""
+COMPILE_PER_OPERATOR = 1.6
+"""Seconds to compile a scene's programs on two cores, per conditional problem (they share programs); for the estimate."""
 
 HELD_OUT = 1000
 """Seed of the runs that make the reference set; no other run has it."""
@@ -69,8 +69,8 @@ class Budget:
 
 
 QUICK = Budget(
-    seconds=3.0,
-    seeds=2,
+    seconds=2.0,
+    seeds=1,
     instances=2,
     coverage_least=50,
     sweep_instances=1,
@@ -78,7 +78,7 @@ QUICK = Budget(
     prices=(0.1, 1.0, 10.0),
     exploration=(0.003, 0.3),
     oracle_instances=1,
-    survey_seconds_per_operator=0.2,
+    survey_seconds_per_operator=0.1,
     screened=8,
     screen_seconds=1.0,
     top=2,
@@ -234,8 +234,11 @@ class Study:
         total = 0.0
         for scene in self.scenes:
             missing = [run for run in self.runs(scene) if not self.store.has(run)]
-            total += sum(run.seconds + RUN_OVERHEAD for run in missing) + (COMPILE_ESTIMATE if missing else 0.0)
+            total += sum(run.seconds + RUN_OVERHEAD for run in missing) + (self._compile_estimate(scene) if missing else 0.0)
         return total
+
+    def _compile_estimate(self, scene: str) -> float:
+        return COMPILE_PER_OPERATOR * len(self.problem(scene).transitions.problems())
 
     def execute(self) -> Iterator[Progress]:
         """Makes the missing runs."""
@@ -247,7 +250,7 @@ class Study:
                 continue
             yield Progress(f"{scene}: compiling", done, total)
             self._compile(scene)
-            done += COMPILE_ESTIMATE
+            done += self._compile_estimate(scene)
             for run in missing:
                 yield Progress(f"{scene} {run.instance}: {run.stage} {run.method}, seed {run.seed}", done, total)
                 self._execute(run)
