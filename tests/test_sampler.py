@@ -1,0 +1,135 @@
+"""Algorithm 1 over pick_place: what the events say adds up, runs repeat, failures cost what they should."""
+
+import itertools
+
+import numpy as np
+import pytest
+from loaded import problem
+
+from cgs_jax.api import make_chooser
+from cgs_jax.sampler import Finished, Found, Pool, Ran, Sampler, SamplerSettings, Started
+
+SETTINGS = SamplerSettings(batch_size=128, lanes=32, workers=1, deterministic=True)
+
+
+def sampler(method="expert2", seed=0, **changes):
+    at = problem("pick_place")
+    settings = SamplerSettings(**(vars(SETTINGS) | changes))
+    return Sampler(at, make_chooser(at, method, seed, pools=settings.pools), seed, settings)
+
+
+def run(method="expert2", budget=20.0, number=60, **changes):
+    return list(sampler(method, **changes).events(budget, number))
+
+
+def of(kind, events):
+    return [event for event in events if isinstance(event, kind)]
+
+
+@pytest.fixture(scope="module")
+def fixed():
+    return run()
+
+
+def test_a_fixed_sequence_is_the_only_one_that_runs(fixed):
+    paths = {" ".join(map(str, event.path)) for event in of(Ran, fixed)}
+    assert len(paths) == 1
+    texts = {event.sequence for event in of(Found, fixed)}
+    assert texts == {problem("pick_place").transitions.format(of(Ran, fixed)[0].path)}
+    assert {event.position for event in of(Ran, fixed)} == {0, 1, 2}
+
+
+def test_events_come_in_order_and_end_with_the_number_asked_for(fixed):
+    assert sum(len(event.qpos) for event in of(Found, fixed)) == 60
+    assert len(of(Started, fixed)) == 1 and isinstance(fixed[-1], Finished) and fixed[-1].reason == "samples"
+    times = [event.elapsed for event in of(Found, fixed)]
+    assert times == sorted(times)
+    for event in of(Found, fixed):
+        assert {name: len(value) for name, value in event.values.items()} == dict.fromkeys(("t", "q1", "q2"), len(event.qpos))
+        assert event.qpos.shape[1:] == (2, problem("pick_place").scene.model.nq)
+
+
+def test_numbers_of_a_batch_add_up(fixed):
+    for event in of(Ran, fixed):
+        assert event.tasks >= event.proposed >= event.cleared >= 0
+        assert sum(event.failures.values()) == event.tasks - event.cleared
+        assert set(event.failures) <= set(event.path[event.position].constraints)
+        assert event.first_successes <= event.first_tries and event.second_successes <= event.second_tries
+        assert event.first_tries + event.second_tries <= event.tasks
+
+
+def test_no_step_uses_more_conditions_than_the_steps_before_made(fixed):
+    made, fresh = dict.fromkeys(range(3), 0), dict.fromkeys(range(3), 0)
+    for event in of(Ran, fixed):
+        made[event.position] += event.cleared
+        fresh[event.position] += event.first_tries
+        if event.position:
+            assert fresh[event.position] <= made[event.position - 1]
+
+
+def test_no_two_samples_share_a_value(fixed):
+    for name in ("t", "q1", "q2"):
+        values = np.concatenate([event.values[name] for event in of(Found, fixed)])
+        assert len(np.unique(values, axis=0)) == len(values)
+
+
+def test_the_same_seed_repeats_the_run_and_another_does_not(fixed):
+    again, other = run(), run(seed=1)
+    first, second, third = (np.concatenate([e.values["q2"] for e in of(Found, events)]) for events in (fixed, again, other))
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(first[:5] - third[:5]).max() > 1e-3
+
+
+def test_a_condition_is_tried_as_often_as_the_settings_say():
+    once = of(Ran, run(tries=1))
+    assert sum(event.second_tries for event in once) == 0
+    assert all(event.first_tries == event.tasks for event in once)
+    assert sum(event.second_tries for event in of(Ran, run())) > 0
+
+
+def test_without_pools_the_same_samples_are_valid():
+    events = run(pools=False, number=20)
+    assert sum(len(event.qpos) for event in of(Found, events)) == 20
+
+
+def test_samples_are_neither_piled_on_limits_nor_on_each_other(fixed):
+    low, high = problem("pick_place").params.limits["q1"]
+    for name in ("q1", "q2"):
+        q = np.concatenate([event.values[name] for event in of(Found, fixed)])
+        at_limit = (np.minimum(q - low, high - q) < 1e-3 * (high - low)).any(axis=1)
+        assert at_limit.mean() < 0.05
+        near = [np.abs(a - b).max() < 1e-2 for a, b in itertools.combinations(q, 2)]
+        assert np.mean(near) < 0.01
+
+
+def test_stop_ends_the_run_after_the_batches_in_flight():
+    at_work = sampler()
+    events = []
+    for event in at_work.events(60.0):
+        events.append(event)
+        if isinstance(event, Found):
+            at_work.stop()
+    assert events[-1].reason == "interrupt"
+    assert len(of(Found, events)) >= 1
+
+
+def test_the_budget_ends_the_run():
+    events = run(budget=0.3, number=None, deterministic=False)
+    assert events[-1].reason == "time" and 0.3 <= events[-1].elapsed < 3.0
+
+
+def test_independent_components_survive_a_failure():
+    # q1 and q2 depend on each other through t alone; t waits in its pool until both steps have drawn from it.
+    events = of(Ran, run("t; q1; q2"))
+    cleared = {k: sum(e.cleared for e in events if e.position == k) for k in range(3)}
+    assert cleared[0] >= cleared[1] >= cleared[2] > 0
+
+
+def test_a_pool_gives_back_in_order_what_was_put_in():
+    pool = Pool()
+    for part in (np.arange(3), np.arange(3, 8), np.empty(0)):
+        pool.put({"x": part})
+    assert pool.size == 8
+    np.testing.assert_array_equal(pool.take(5)["x"], np.arange(5))
+    np.testing.assert_array_equal(pool.take(3)["x"], np.arange(5, 8))
+    assert pool.size == 0
