@@ -94,10 +94,11 @@ def propose(
     """Draws a seed for each task and projects it; pure.
 
     `given` is `(tasks, given, 7)`, `given_configurations` `(tasks, dof)` each. `count` (traced) of the tasks are in use. The
-    random stream of a task is a function of `key` and `first_task + position`.
+    random stream of a task is a function of `key` (a key or its data) and `first_task + position`.
     """
     tasks = given.shape[0]
     numbers = jax.tree.map(jnp.asarray, numbers)
+    key = jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
     numbers_of = jnp.asarray(first_task, jnp.uint32) + jnp.arange(tasks, dtype=jnp.uint32)
     vectors = jnp.transpose(jnp.asarray(given), (2, 1, 0))  # (7, given, tasks)
     configurations = tuple(jnp.asarray(q).T for q in given_configurations)
@@ -225,6 +226,11 @@ class Clear:
     poses: tuple[Term, ...]
     configurations: tuple[str, ...]
     chains: tuple[str, ...]
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Variables that it mentions."""
+        return (*self.configurations, *(term.name for term in self.poses if term.kind == "pose"))
 
     def numbers(self, params: Params) -> ClearanceNumbers:
         """The unchanging arguments of `clearance`."""
@@ -436,7 +442,7 @@ COMPILER_OPTIONS: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512, "xla_cpu
 """Measured on `propose`: a quarter less time to run and to compile than XLA's defaults; other backends do not read them."""
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def propose_program(layout: Layout, settings: al.Settings, lanes: int) -> Callable:
     """The jitted `propose` of a layout; the same object for the same arguments, so that it compiles once."""
     return jax.jit(functools.partial(propose, layout, settings, lanes), compiler_options=_compiler_options())
@@ -446,7 +452,7 @@ def _compiler_options() -> dict[str, Any]:
     return COMPILER_OPTIONS if jax.default_backend() == "cpu" else {}
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def clearance_program(layout: ClearanceLayout) -> Callable:
     """The jitted `clearance` of a layout."""
     return jax.jit(functools.partial(clearance, layout), compiler_options=_compiler_options())

@@ -7,7 +7,11 @@ never counted as sampling, and so that a scheduler can ask whether a program is 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import os
+import pickle
+import platform
 import threading
 import time
 from collections.abc import Callable
@@ -16,7 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-from filelock import FileLock, Timeout
+from jax.experimental import serialize_executable
 
 CACHE_BYTES = 512 * 2**20
 """Size to which the cache on disk is kept; the programs used longest ago go first."""
@@ -24,46 +28,104 @@ CACHE_BYTES = 512 * 2**20
 _lock = threading.Lock()
 _compiled: dict[Any, Future] = {}
 _pool: ThreadPoolExecutor | None = None
+_folder: Path | None = None
+_writing = threading.Lock()
 
 
 def enable_disk_cache(folder: str | os.PathLike[str] | None = None) -> Path:
     """Keeps compiled programs in a folder, by default `cgs_jax` under `XDG_CACHE_HOME` (default `~/.cache`).
 
-    JAX writes entries atomically, so several processes may share the folder. Returns the folder.
+    Entries are whole executables: what is found is neither traced nor compiled. (JAX's own cache still traces, and what comes
+    out of it cannot be handed to another process.) An entry is written under another name and renamed, so that several
+    processes may share the folder. Returns the folder.
     """
+    global _folder
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    path = Path(folder) if folder is not None else Path(base) / "cgs_jax"
-    jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    jax.config.update("jax_compilation_cache_max_size", CACHE_BYTES)
-    return path
+    _folder = Path(folder) if folder is not None else Path(base) / "cgs_jax"
+    return _folder
 
 
 def end_process(status: int) -> NoReturn:
-    """Ends the process at once, where a normal exit would wait for every program that is still to be compiled.
-
-    Waits for a write to the cache on disk to end: JAX cannot read an entry that was cut short, nor make room beside one.
-    """
-    folder = jax.config.values.get("jax_compilation_cache_dir")
-    if folder and os.path.isdir(folder):
-        # Held until the process is gone, so that no further write begins.
-        lock = FileLock(os.path.join(folder, ".lockfile"), timeout=10)
-        with contextlib.suppress(Timeout, OSError):
-            lock.acquire()
+    """Ends the process at once, where a normal exit would wait for every program that is still to be compiled."""
+    _writing.acquire(timeout=10)
     os._exit(status)
+
+
+@functools.cache
+def _environment() -> str:
+    """What a compiled program depends on besides its key: this package's text, jax, and the processor."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    cpu = Path("/proc/cpuinfo")
+    features = cpu.read_text().split("\n\n")[0] if cpu.exists() else platform.processor()
+    digest.update("\n".join(line for line in features.splitlines() if line.startswith(("flags", "model name"))).encode())
+    digest.update(f"{jax.__version__} {jax.default_backend()} {platform.machine()} {platform.python_version()}".encode())
+    return digest.hexdigest()
+
+
+def _entry(key: str | None, shapes: tuple) -> Path | None:
+    """File of a program in the cache; None where it is not to be cached."""
+    if key is None or _folder is None:
+        return None
+    text = f"{_environment()} {key} {_signature(shapes)}"
+    return _folder / f"{hashlib.sha256(text.encode()).hexdigest()}.program"
+
+
+def _store(path: Path, data: bytes) -> None:
+    with _writing, contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}.part")
+        part.write_bytes(data)
+        part.replace(path)
+        entries = [(entry.stat().st_mtime, entry.stat().st_size, entry) for entry in path.parent.glob("*.program")]
+        excess = sum(size for _, size, _ in entries) - CACHE_BYTES
+        for _, size, entry in sorted(entries):
+            if excess <= 0:
+                break
+            entry.unlink(missing_ok=True)
+            excess -= size
+
+
+def _stored(path: Path | None) -> Program | None:
+    """The program in a file of the cache; None without the file, or where it cannot be read."""
+    if path is None or not path.exists():
+        return None
+    began = time.perf_counter()
+    try:
+        program = load_portable(path.read_bytes())
+    except Exception:  # noqa: BLE001 - a damaged entry is replaced by a new one
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    program.seconds = time.perf_counter() - began
+    return program
 
 
 class Program:
     """One compiled program and what it took to make it."""
 
-    def __init__(self, name: str, executable: Callable, seconds: float) -> None:
+    def __init__(self, name: str, executable: Callable, seconds: float, portable: bytes | None = None) -> None:
         self.name, self.seconds = name, seconds
         self._executable = executable
+        self._portable = portable
 
     def __call__(self, *arguments: Any) -> Any:
         """Runs it and waits for the result; releases the GIL meanwhile."""
         return jax.block_until_ready(self._executable(*arguments))
+
+    @property
+    def portable(self) -> bytes:
+        """The compiled program, to be loaded by another process on this machine (`load_portable`)."""
+        if self._portable is None:
+            self._portable = pickle.dumps((self.name, serialize_executable.serialize(self._executable)))
+        return self._portable
+
+
+def load_portable(data: bytes) -> Program:
+    """The program of `Program.portable`: no tracing, no compiling."""
+    name, parts = pickle.loads(data)
+    return Program(name, serialize_executable.deserialize_and_load(*parts), 0.0, data)
 
 
 def _signature(arguments: Any) -> Any:
@@ -71,21 +133,22 @@ def _signature(arguments: Any) -> Any:
     return structure, tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
 
 
-def request(name: str, function: Callable, arguments: tuple) -> Future[Program]:
+def request(name: str, function: Callable, arguments: tuple, key: str | None = None) -> Future[Program]:
     """The program of a jitted function for arguments of these shapes; compiled on a thread of its own unless known.
 
-    `function` must be the same object for the same program (see `operators.propose_program`).
+    `function` must be the same object for the same program (see `operators.propose_program`). `key` says all that the
+    function depends on; without one the program is not cached on disk.
     """
     global _pool
-    key = (function, _signature(arguments))
+    known = (function, _signature(arguments))
     with _lock:
-        if key not in _compiled:
+        if known not in _compiled:
             if _pool is None:
                 # One thread: two compilations at a time would double the memory and gain nothing beside sampling.
                 _pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
             shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), arguments)
-            _compiled[key] = _pool.submit(_compile, name, function, shapes)
-        return _compiled[key]
+            _compiled[known] = _pool.submit(_make, name, function, shapes, key)
+        return _compiled[known]
 
 
 def all_requested() -> list[Future[Program]]:
@@ -94,7 +157,14 @@ def all_requested() -> list[Future[Program]]:
         return list(_compiled.values())
 
 
-def _compile(name: str, function: Any, shapes: tuple) -> Program:
+def _make(name: str, function: Any, shapes: tuple, key: str | None) -> Program:
+    path = _entry(key, shapes)
+    program = _stored(path)
+    if program is not None:
+        return program
     start = time.perf_counter()
     executable = function.lower(*shapes).compile()
-    return Program(name, executable, time.perf_counter() - start)
+    program = Program(name, executable, time.perf_counter() - start)
+    if path is not None:
+        _store(path, program.portable)
+    return program

@@ -7,7 +7,8 @@ only the components that its operator read. A prefix may be tried a few times an
 finished samples share a value.
 
 The chooser (UCT tree, fixed sequence, random) picks a sequence; what runs is its last operator if that has a batch waiting,
-else, by the same rule, the operator that makes what it lacks most. Two workers keep the device busy; all decisions are made by the one scheduling thread.
+else, by the same rule, the operator that makes what it lacks most. One batch runs in this process and one in each worker
+process; all decisions are made by the one scheduling thread.
 """
 
 from __future__ import annotations
@@ -17,31 +18,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
-from cgs_jax import programs
-from cgs_jax.audit import Auditor, Tolerances
+from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
-from cgs_jax.keyframes import Keyframes
-from cgs_jax.operators import (
-    PENETRATION,
-    Operator,
-    clearance_program,
-    gather_given,
-    gather_poses,
-    operator_of,
-    propose_program,
-)
+from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
+from cgs_jax.operators import Operator, operator_of
 from cgs_jax.problems import Problem
-from cgs_jax.scene import attachments, goals, placements
 from cgs_jax.transitions import Transition
 from cgs_jax.uct import Chooser
+from cgs_jax.worker import Setup, Worker
 
-Values = dict[str, np.ndarray]
 Path = tuple[Transition, ...]
 
 
@@ -163,21 +153,8 @@ class _Job:
     path: Path
     position: int
     step: _Step
-    conditions: Values
+    batch: Batch
     tries: np.ndarray  # (n,) earlier tries of each condition
-    first_task: int
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    values: Values  # conditions and new variables of the successes
-    success: np.ndarray  # (n,) bool
-    proposed: int
-    iterations: int
-    failures: Mapping[str, int]
-    device_seconds: float
-    host_seconds: float
-    finished: Found | None
 
 
 TRIES = 0
@@ -204,8 +181,59 @@ class SamplerSettings:
     """Settings of the projection."""
 
 
-WORK_SECONDS = 1e-7
-"""Deterministic runs: device seconds that one iteration of one unknown is taken for."""
+class _Crew:
+    """Who runs batches: worker processes where the problem can be loaded there, and this process until they have arrived."""
+
+    def __init__(self, runner: BatchRunner, workers: int, setup: Setup | None) -> None:
+        self._free: queue.SimpleQueue[BatchRunner | Worker] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._wanted, self._arrived = workers, 0
+        self._local = runner
+        self.size = 0
+        """Batches that can run at once now."""
+        self._workers: list[Worker] = []
+        if setup is None:
+            for _ in range(workers):
+                self._seat(runner)
+            return
+        self._seat(runner)
+        for _ in range(workers):
+            self._hire(setup)
+
+    def _seat(self, member: BatchRunner | Worker) -> None:
+        with self._lock:
+            self._free.put(member)
+            self.size = min(self.size + 1, self._wanted)
+
+    def _hire(self, setup: Setup) -> None:
+        worker = Worker(setup)
+        self._workers.append(worker)
+
+        def arrive() -> None:
+            if worker.await_ready():
+                self._arrived += 1
+                self._seat(worker)
+
+        threading.Thread(target=arrive, daemon=True).start()
+
+    def run(self, batch: Batch) -> Outcome:
+        """Runs a batch on whoever is free."""
+        member = self._free.get()
+        # With all workers there, this process has its core for compiling and deciding.
+        if member is self._local and self._workers and self._arrived == self._wanted:
+            member = self._free.get()
+        try:
+            if isinstance(member, Worker):
+                operator = operator_of(self._local.problem, batch.transition)
+                member.install(operator.identity, [future.result() for future in self._local.request(operator)])
+            return member.run(batch)
+        finally:
+            self._free.put(member)
+
+    def close(self) -> None:
+        """Ends the worker processes."""
+        for worker in self._workers:
+            worker.close()
 
 
 class Sampler:
@@ -220,25 +248,16 @@ class Sampler:
         tolerances: Tolerances | None = None,
     ) -> None:
         self.problem, self.chooser, self.settings = problem, chooser, settings or SamplerSettings()
-        task = problem.scene.task
-        self.auditor = Auditor(
-            problem.scene.model,
-            attachments(task),
-            placements(task),
-            goals(task),
-            [switch.name for switch in task.switches],
-            tolerances,
-        )
-        self._keyframes = Keyframes(problem)
-        self._key = jax.random.key(seed)
+        s = self.settings
+        self._batch_settings = BatchSettings(s.batch_size, s.lanes, s.solver, counted_time=s.deterministic)
+        self._seed, self._tolerances = seed, tolerances
+        self._runner = BatchRunner(problem, seed, self._batch_settings, tolerances)
+        self.auditor = self._runner.auditor
         self._pools: dict[History, Pool] = {}
         self._waiting: dict[History, Pool] = {}
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
-        self._numbers: dict[Any, Any] = {}
-        self._keys: dict[int, jax.Array] = {}
-        self._requested: dict[int, list[Future]] = {}
         self._announced: set[int] = set()
         self._full = problem.transitions.full
         self._stop = threading.Event()
@@ -249,53 +268,8 @@ class Sampler:
 
     # -------------------------------------------------------------- programs
 
-    def _arguments(self, operator: Operator) -> tuple[tuple, list[tuple]]:
-        """Arguments of the shapes that `propose` and each clearance of an operator are called with."""
-        batch = self.settings.batch_size
-        scalar = np.zeros((), np.int32)
-        given = np.zeros((batch, operator.plan.layout.given, 7), np.float32)
-        of_function = tuple(
-            np.zeros((batch, self.problem.dofs[name]), np.float32) for name in operator.plan.given_configurations
-        )
-        propose = (self._key_of(operator), np.uint32(0), scalar, given, of_function, self._numbers_of(operator))
-        clears = []
-        for clear in operator.clears:
-            poses = np.zeros((batch, len(clear.poses), 7), np.float32)
-            q = tuple(np.zeros((batch, self.problem.dofs[name]), np.float32) for name in clear.configurations)
-            clears.append((scalar, poses, q, self._numbers_of(clear)))
-        return propose, clears
-
-    def _numbers_of(self, what: Any) -> Any:
-        key = (type(what).__name__, what.constraint if hasattr(what, "constraint") else what.identity)
-        if key not in self._numbers:
-            numbers = what.numbers(self.problem.params)
-            self._numbers[key] = jax.device_put(numbers)
-        return self._numbers[key]
-
-    def _key_of(self, operator: Operator) -> jax.Array:
-        if operator.identity not in self._keys:
-            self._keys[operator.identity] = jax.random.fold_in(self._key, operator.identity)
-        return self._keys[operator.identity]
-
-    def _request(self, operator: Operator) -> list[Future]:
-        if operator.identity not in self._requested:
-            propose, clears = self._arguments(operator)
-            s = self.settings
-            futures = [
-                programs.request(
-                    f"solve {_shape_text(operator)}", propose_program(operator.plan.layout, s.solver, s.lanes), propose
-                )
-            ]
-            for clear, arguments in zip(operator.clears, clears, strict=True):
-                futures.append(
-                    programs.request(f"clearance {clear.constraint}", clearance_program(clear.layout), arguments)
-                )
-            self._requested[operator.identity] = futures
-        return self._requested[operator.identity]
-
     def _ready(self, transition: Transition) -> bool:
-        futures = self._requested.get(operator_of(self.problem, transition).identity)
-        return futures is not None and all(future.done() for future in futures)
+        return self._runner.ready(operator_of(self.problem, transition))
 
     def compile_order(self) -> list[Transition]:
         """One transition per conditional problem: first those of the sequence that is cheapest to compile, then by size."""
@@ -345,13 +319,18 @@ class Sampler:
         """Runs until the budget (s of sampling time) or the number of samples is reached; yields events as they happen."""
         begun = clock()
         order = self._initial_requests()
-        yield from self._await_first(order)
+        crew = self._crew()
+        try:
+            yield from self._await_first(order)
+        except BaseException:
+            crew.close()
+            raise
         start = clock()
         yield Started(start - begun)
         found = 0
         reason = "time"
-        workers = ThreadPoolExecutor(self.settings.workers, thread_name_prefix="sample")
-        in_flight: list[tuple[_Job, Future[_Outcome]]] = []
+        threads = ThreadPoolExecutor(self.settings.workers, thread_name_prefix="sample")
+        in_flight: list[tuple[_Job, Future[Outcome]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
         try:
             while True:
@@ -364,11 +343,11 @@ class Sampler:
                 if num_samples is not None and found >= num_samples:
                     reason = "samples"
                     break
-                while len(in_flight) < self.settings.workers:
+                while len(in_flight) < crew.size:
                     job = self._next_job()
                     if job is None:
                         break
-                    future = workers.submit(self._run, job)
+                    future = threads.submit(crew.run, job.batch)
                     future.add_done_callback(lambda _: done.put(None))
                     in_flight.append((job, future))
                 yield from self._announcements()
@@ -390,8 +369,17 @@ class Sampler:
                         found += len(event.qpos)
                     yield event
         finally:
-            workers.shutdown(wait=True, cancel_futures=True)
+            threads.shutdown(wait=True, cancel_futures=True)
+            crew.close()
         yield Finished(reason, clock() - start)
+
+    def _crew(self) -> _Crew:
+        source, workers = self.problem.source, self.settings.workers
+        if source is None or workers == 1:
+            return _Crew(self._runner, workers, None)
+        scene, instance = source
+        setup = Setup(scene, instance, self._seed, self._batch_settings, self._tolerances)
+        return _Crew(self._runner, workers, setup)
 
     def _initial_requests(self) -> list[Operator]:
         """Requests the programs in the order in which they are useful; returns the operators to wait for."""
@@ -403,10 +391,10 @@ class Sampler:
             first = self._cheapest_path(order)
             operators = [operator_of(self.problem, transition) for transition in first]
         for operator in operators:
-            self._request(operator)
+            self._runner.request(operator)
         if not path:
             for transition in order:
-                self._request(operator_of(self.problem, transition))
+                self._runner.request(operator_of(self.problem, transition))
         return operators
 
     def _cheapest_path(self, order: list[Transition]) -> Path:
@@ -422,7 +410,7 @@ class Sampler:
 
     def _await_first(self, operators: list[Operator]) -> Iterator[Event]:
         for operator in operators:
-            for future in self._request(operator):
+            for future in self._runner.request(operator):
                 while not future.done():
                     if self._stop.is_set():
                         return
@@ -432,18 +420,17 @@ class Sampler:
         yield from self._announcements()
 
     def _announcements(self) -> Iterator[Event]:
-        for futures in self._requested.values():
-            for future in futures:
-                if id(future) not in self._announced and future.done():
-                    self._announced.add(id(future))
-                    program = future.result()
-                    yield Compiled(program.name, program.seconds)
+        for future in self._runner.requested():
+            if id(future) not in self._announced and future.done():
+                self._announced.add(id(future))
+                program = future.result()
+                yield Compiled(program.name, program.seconds)
 
     def _next_job(self) -> _Job | None:
         if self.settings.deterministic:
             path = self.chooser.select(None)
             for step in self._steps_of(path):
-                for future in self._request(step.operator):
+                for future in self._runner.request(step.operator):
                     future.result()
         else:
             path = self.chooser.select(self._ready)
@@ -463,7 +450,7 @@ class Sampler:
             enough = batch // 16 if young else batch // 4
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
-                count = batch if step.reads or not young else batch // 4
+                count = batch // 8 if young else batch
                 self._visits[slot] = self._visits.get(slot, 0) + 1
                 return self._job(path, position, step, waiting, count)
             position = makers[scarcest]
@@ -491,76 +478,8 @@ class Sampler:
             count = len(tries)
         first = self._tasks.get(step.operator.identity, 0)
         self._tasks[step.operator.identity] = first + count
-        return _Job(path, position, step, conditions, tries, first)
-
-    # -------------------------------------------------------------- worker side
-
-    def _run(self, job: _Job) -> _Outcome:
-        """Runs one batch; called on a worker thread, changes nothing shared."""
-        began = time.perf_counter()
-        operator, problem = job.step.operator, self.problem
-        count, batch = len(job.tries), self.settings.batch_size
-        padded = {name: _fill(value, batch) for name, value in job.conditions.items()}
-        given = gather_given(operator, problem.params, padded, batch)
-        of_function = tuple(padded[name] for name in operator.plan.given_configurations)
-        futures = self._request(operator)
-        propose = futures[0].result()
-        key, numbers = self._key_of(operator), self._numbers_of(operator)
-        device = -time.perf_counter()
-        result = propose(key, np.uint32(job.first_task % 2**32), np.int32(count), given, of_function, numbers)
-        device += time.perf_counter()
-        rows_hold = np.asarray(result.feasible)[:count]
-        violation = np.asarray(result.violation)[: len(operator.measured), :count]
-        iterations = int(np.asarray(result.iterations)[:count].sum())
-        new = {name: np.asarray(value)[:count] for name, value in operator.named(result).items()}
-        failures: dict[str, int] = {}
-        if len(operator.measured):
-            worst = np.argmax(violation[:, ~rows_hold], axis=0)
-            for at, times in zip(*np.unique(worst, return_counts=True), strict=True):
-                failures[operator.measured[at]] = int(times)
-        success = np.flatnonzero(rows_hold)
-        proposed = len(success)
-        values = {name: value[success] for name, value in (job.conditions | new).items()}
-        for clear, future in zip(operator.clears, futures[1:], strict=True):
-            if not len(success):
-                break
-            padded = {name: _fill(value, batch) for name, value in values.items()}
-            poses = gather_poses(clear, problem.params, padded, batch)
-            q = tuple(padded[name] for name in clear.configurations)
-            device -= time.perf_counter()
-            distance = future.result()(np.int32(len(success)), poses, q, self._numbers_of(clear))
-            device += time.perf_counter()
-            clears = np.asarray(distance)[: len(success)] >= -PENETRATION
-            if not clears.all():
-                failures[clear.constraint] = failures.get(clear.constraint, 0) + int((~clears).sum())
-                success = success[clears]
-                values = {name: value[clears] for name, value in values.items()}
-        mask = np.zeros(count, bool)
-        mask[success] = True
-        finished, audit_seconds = None, 0.0
-        if job.step.transition.target == self._full and len(success) and not self._final_histories(job.path):
-            finished = self._finish(values, job.path)
-            audit_seconds = finished.audit_seconds
-        if self.settings.deterministic:
-            device = WORK_SECONDS * (count + iterations) * (1 + operator.plan.layout.unknowns)
-        host = time.perf_counter() - began - device - audit_seconds
-        return _Outcome(values, mask, proposed, iterations, failures, device, max(host, 0.0), finished)
-
-    def _finish(self, values: Values, path: Path) -> Found:
-        """Keyframes and audit of full samples."""
-        began = time.perf_counter()
-        qpos = self._keyframes.qpos(values)
-        result = self.auditor.check(qpos, values)
-        kept = np.flatnonzero(result.ok)
-        return Found(
-            values={name: value[kept] for name, value in values.items()},
-            qpos=qpos[kept],
-            violation=result.violation[kept],
-            sequence=self.problem.transitions.format(path),
-            elapsed=0.0,
-            rejected=len(qpos) - len(kept),
-            audit_seconds=time.perf_counter() - began,
-        )
+        completes = step.transition.target == self._full and not self._final_histories(path)
+        return _Job(path, position, step, Batch(step.transition, conditions, count, first, completes), tries)
 
     # -------------------------------------------------------------- results
 
@@ -571,7 +490,7 @@ class Sampler:
             given_up &= job.tries + 1 >= self.settings.tries
             again = ~success & ~given_up
             if again.any():
-                part = {name: value[again] for name, value in job.conditions.items()}
+                part = {name: value[again] for name, value in job.batch.conditions.items()}
                 waiting = self._waiting[job.step.makes]
                 waiting.put(part | {TRIES: job.tries[again] + 1})
         first, second = job.tries == 0, job.tries == 1
@@ -590,25 +509,33 @@ class Sampler:
             device_seconds=outcome.device_seconds,
             host_seconds=outcome.host_seconds,
         )
-        counted = int(success.sum())
-        if outcome.finished is not None:
-            counted = len(outcome.finished.qpos)
+        audited = outcome.audited
         self.chooser.record(
             job.path[: job.position],
             job.step.transition,
             conditions=int((success | given_up).sum()),
-            successes=counted,
+            successes=int(success.sum()) if audited is None else len(audited.qpos),
             seconds=outcome.device_seconds,
             visits=max(len(success) / self.settings.batch_size, 0.1),
             attempts=len(success),
         )
-        if outcome.finished is not None:
-            yield _at(outcome.finished, elapsed)
-        elif job.step.transition.target == self._full and self._final_histories(job.path):
+        if audited is not None:
+            yield self._found(audited, job.path, elapsed)
+        elif not job.batch.completes:
             self._pool(job.step.makes).put(outcome.values)
-            yield from self._join(job, elapsed)
-        else:
-            self._pool(job.step.makes).put(outcome.values)
+            if job.step.transition.target == self._full:
+                yield from self._join(job, elapsed)
+
+    def _found(self, audited: Audited, path: Path, elapsed: float) -> Found:
+        return Found(
+            values=audited.values,
+            qpos=audited.qpos,
+            violation=audited.violation,
+            sequence=self.problem.transitions.format(path),
+            elapsed=elapsed,
+            rejected=audited.rejected,
+            audit_seconds=audited.seconds,
+        )
 
     def _join(self, job: _Job, elapsed: float) -> Iterator[Event]:
         """Full samples from components that no constraint links."""
@@ -618,39 +545,12 @@ class Sampler:
             values: Values = {}
             for pool in pools:
                 values |= pool.take(count)
-            yield _at(self._finish(values, job.path), elapsed)
-
-
-def _fill(value: np.ndarray, rows: int) -> np.ndarray:
-    """The value with zero rows appended."""
-    if len(value) == rows:
-        return value
-    result = np.zeros((rows, *value.shape[1:]), value.dtype)
-    result[: len(value)] = value
-    return result
+            yield self._found(self._runner.audit(values), job.path, elapsed)
 
 
 def _first(event: Found, count: int) -> Found:
-    return Found(
-        {name: value[:count] for name, value in event.values.items()},
-        event.qpos[:count],
-        event.violation[:count],
-        event.sequence,
-        event.elapsed,
-        event.rejected,
-        event.audit_seconds,
-    )
-
-
-def _at(event: Found, elapsed: float) -> Found:
-    return Found(
-        event.values, event.qpos, event.violation, event.sequence, elapsed, event.rejected, event.audit_seconds
-    )
-
-
-def _shape_text(operator: Operator) -> str:
-    layout = operator.plan.layout
-    return f"{layout.configurations} configurations, {layout.free} free poses"
+    values = {name: value[:count] for name, value in event.values.items()}
+    return replace(event, values=values, qpos=event.qpos[:count], violation=event.violation[:count])
 
 
 def _greedy_path(transitions: Any, allowed: set) -> Path:

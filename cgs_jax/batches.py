@@ -1,0 +1,237 @@
+"""One batch of one operator: the thin bridge between plain Python that decides and device programs that compute.
+
+A `BatchRunner` has everything that runs a batch of one problem; it decides nothing and keeps no samples. The sampler has one
+in its own process, and further ones in worker processes (`cgs_jax.worker`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from cgs_jax import programs
+from cgs_jax.audit import Auditor, Tolerances
+from cgs_jax.augmented_lagrangian import Settings
+from cgs_jax.keyframes import Keyframes
+from cgs_jax.operators import (
+    PENETRATION,
+    Operator,
+    clearance_program,
+    gather_given,
+    gather_poses,
+    operator_of,
+    propose_program,
+)
+from cgs_jax.problems import Problem
+from cgs_jax.scene import attachments, goals, placements
+from cgs_jax.transitions import Transition
+
+Values = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What to run: plain data, so that it can be sent to another process."""
+
+    transition: Transition
+    conditions: Values
+    """Assigned variables `(tasks, dim)`; those of the condition are read, the others travel along."""
+    tasks: int
+    first_task: int
+    """Number of the first task in the operator's random stream."""
+    completes: bool
+    """Whether successes are full samples, to be audited."""
+
+
+@dataclass(frozen=True)
+class Audited:
+    """Full samples that passed the audit."""
+
+    values: Values
+    qpos: np.ndarray  # (N, K, nq)
+    violation: np.ndarray  # (N, C)
+    rejected: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a batch."""
+
+    values: Values
+    """Conditions and new variables of the successes, in order."""
+    success: np.ndarray  # (tasks,) bool
+    proposed: int
+    """Tasks whose rows were solved."""
+    iterations: int
+    failures: Mapping[str, int]
+    """Tasks stopped by each constraint; a task that violates several rows counts for the worst."""
+    device_seconds: float
+    host_seconds: float
+    audited: Audited | None
+
+
+@dataclass(frozen=True)
+class BatchSettings:
+    """What programs are compiled for and samples are held to."""
+
+    batch_size: int
+    lanes: int
+    solver: Settings
+    counted_time: bool = False
+    """Report counted work (`WORK_SECONDS`) in place of measured device time."""
+
+
+WORK_SECONDS = 1e-7
+"""Counted work: device seconds that one iteration of one unknown is taken for."""
+
+
+class BatchRunner:
+    """Runs batches of one problem; may be shared by threads."""
+
+    def __init__(self, problem: Problem, seed: int, settings: BatchSettings, tolerances: Tolerances | None = None) -> None:
+        self.problem, self.settings = problem, settings
+        task = problem.scene.task
+        switches = [switch.name for switch in task.switches]
+        self.auditor = Auditor(
+            problem.scene.model, attachments(task), placements(task), goals(task), switches, tolerances
+        )
+        self._keyframes = Keyframes(problem)
+        self._seed = seed
+        self._numbers: dict[Any, Any] = {}
+        self._requested: dict[int, list[Future]] = {}
+        self._lock = threading.Lock()
+
+    # -------------------------------------------------------------- programs
+
+    def request(self, operator: Operator) -> list[Future]:
+        """Programs of an operator: `propose`, then the clearances in order. Compiled in the background on first request."""
+        with self._lock:
+            if operator.identity not in self._requested:
+                self._requested[operator.identity] = self._programs(operator)
+            return self._requested[operator.identity]
+
+    def install(self, identity: int, ready: list[programs.Program]) -> None:
+        """Gives an operator programs that were compiled elsewhere."""
+        futures: list[Future] = []
+        for program in ready:
+            futures.append(Future())
+            futures[-1].set_result(program)
+        with self._lock:
+            self._requested[identity] = futures
+
+    def ready(self, operator: Operator) -> bool:
+        """Whether all programs of an operator have been requested and compiled."""
+        futures = self._requested.get(operator.identity)
+        return futures is not None and all(future.done() for future in futures)
+
+    def requested(self) -> list[Future]:
+        """All programs requested so far."""
+        return [future for futures in self._requested.values() for future in futures]
+
+    def _programs(self, operator: Operator) -> list[Future]:
+        s, batch = self.settings, self.settings.batch_size
+        scalar = np.zeros((), np.int32)
+        layout = operator.plan.layout
+        given = np.zeros((batch, layout.given, 7), np.float32)
+        of_function = self._blank_configurations(operator.plan.given_configurations)
+        arguments = (self._key_of(operator), np.uint32(0), scalar, given, of_function, self._numbers_of(operator))
+        name = f"solve {layout.configurations} configurations, {layout.free} free poses"
+        key = None if layout.functions else f"propose {layout} {s.solver} {s.lanes}"
+        futures = [programs.request(name, propose_program(layout, s.solver, s.lanes), arguments, key)]
+        for clear in operator.clears:
+            poses = np.zeros((batch, len(clear.poses), 7), np.float32)
+            arguments = (scalar, poses, self._blank_configurations(clear.configurations), self._numbers_of(clear))
+            name, function = f"clearance {clear.constraint}", clearance_program(clear.layout)
+            futures.append(programs.request(name, function, arguments, f"clearance {clear.layout}"))
+        return futures
+
+    def _blank_configurations(self, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
+        dofs = [self.problem.dofs[name] or 0 for name in names]
+        return tuple(np.zeros((self.settings.batch_size, dof), np.float32) for dof in dofs)
+
+    def _numbers_of(self, what: Any) -> Any:
+        key = what.identity if isinstance(what, Operator) else what.constraint
+        if key not in self._numbers:
+            self._numbers[key] = jax.device_put(what.numbers(self.problem.params))
+        return self._numbers[key]
+
+    def _key_of(self, operator: Operator) -> np.ndarray:
+        """Key data of an operator's random stream."""
+        return np.array([self._seed % 2**32, operator.identity], np.uint32)
+
+    # -------------------------------------------------------------- running
+
+    def run(self, batch: Batch) -> Outcome:
+        """Runs one batch and, where it completes samples, audits them. Waits for its programs."""
+        operator, problem = operator_of(self.problem, batch.transition), self.problem
+        futures = [future.result() for future in self.request(operator)]
+        began = time.perf_counter()
+        count, room = batch.tasks, self.settings.batch_size
+        padded = {name: _fill(batch.conditions[name], room) for name in operator.condition}
+        given = gather_given(operator, problem.params, padded, room)
+        of_function = tuple(padded[name] for name in operator.plan.given_configurations)
+        key, numbers = self._key_of(operator), self._numbers_of(operator)
+        device = -time.perf_counter()
+        result = futures[0](key, np.uint32(batch.first_task % 2**32), np.int32(count), given, of_function, numbers)
+        device += time.perf_counter()
+        rows_hold = np.asarray(result.feasible)[:count]
+        iterations = int(np.asarray(result.iterations)[:count].sum())
+        failures: dict[str, int] = {}
+        if operator.measured:
+            violation = np.asarray(result.violation)[: len(operator.measured), :count]
+            worst = np.argmax(violation[:, ~rows_hold], axis=0)
+            for at, times in zip(*np.unique(worst, return_counts=True), strict=True):
+                failures[operator.measured[at]] = int(times)
+        success = np.flatnonzero(rows_hold)
+        proposed = len(success)
+        new = {name: np.asarray(value)[success] for name, value in operator.named(result).items()}
+        values = {name: value[success] for name, value in batch.conditions.items()} | new
+        for clear, program in zip(operator.clears, futures[1:], strict=True):
+            if not len(success):
+                break
+            padded = {name: _fill(values[name], room) for name in clear.reads}
+            poses = gather_poses(clear, problem.params, padded, room)
+            q = tuple(padded[name] for name in clear.configurations)
+            device -= time.perf_counter()
+            distance = program(np.int32(len(success)), poses, q, self._numbers_of(clear))
+            device += time.perf_counter()
+            clears = np.asarray(distance)[: len(success)] >= -PENETRATION
+            if not clears.all():
+                failures[clear.constraint] = failures.get(clear.constraint, 0) + int((~clears).sum())
+                success = success[clears]
+                values = {name: value[clears] for name, value in values.items()}
+        mask = np.zeros(count, bool)
+        mask[success] = True
+        audited = self.audit(values) if batch.completes and len(success) else None
+        audit_seconds = audited.seconds if audited else 0.0
+        host = max(time.perf_counter() - began - device - audit_seconds, 0.0)
+        if self.settings.counted_time:
+            device = WORK_SECONDS * (count + iterations) * (1 + operator.plan.layout.unknowns)
+        return Outcome(values, mask, proposed, iterations, failures, device, host, audited)
+
+    def audit(self, values: Values) -> Audited:
+        """Keyframes and audit of full samples."""
+        began = time.perf_counter()
+        qpos = self._keyframes.qpos(values)
+        result = self.auditor.check(qpos, values)
+        kept = np.flatnonzero(result.ok)
+        values = {name: value[kept] for name, value in values.items()}
+        rejected = len(qpos) - len(kept)
+        return Audited(values, qpos[kept], result.violation[kept], rejected, time.perf_counter() - began)
+
+
+def _fill(value: np.ndarray, rows: int) -> np.ndarray:
+    """The value with zero rows appended."""
+    if len(value) == rows:
+        return value
+    result = np.zeros((rows, *value.shape[1:]), value.dtype)
+    result[: len(value)] = value
+    return result

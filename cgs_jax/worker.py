@@ -1,0 +1,156 @@
+"""Worker processes: batches run on a core of their own.
+
+XLA's CPU client shares one thread pool among all programs of a process and splits every program over it, which costs up to
+half of the machine for programs as small as ours. A process with a pool of one thread each (`NPROC=1`) does not pay that. A
+worker is this module run with `-m`; it reads pickled messages from its standard input and answers on its standard output. It
+loads the scene by name, so only problems that `load_problem` made can be sent (see `Problem.source`).
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+from cgs_jax.audit import Tolerances
+from cgs_jax.batches import Batch, BatchRunner, BatchSettings, Outcome
+from cgs_jax.problems import load_problem
+from cgs_jax.programs import Program, load_portable
+
+ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""Environment of a process whose programs run on one thread."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """First message: what the worker needs to make its runner."""
+
+    scene: str
+    instance: int
+    seed: int
+    settings: BatchSettings
+    tolerances: Tolerances | None
+
+
+@dataclass(frozen=True)
+class Install:
+    """Programs of an operator, as `Program.portable`; those that were sent before are named by their number alone."""
+
+    identity: int
+    numbers: tuple[int, ...]
+    programs: Mapping[int, bytes]
+
+
+class Worker:
+    """A batch runner in another process; one batch at a time."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cgs_jax.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        )
+        self._send(setup)
+        self._installed: set[int] = set()
+        self._sent: set[int] = set()
+
+    def install(self, identity: int, programs: Sequence[Program]) -> None:
+        """Makes sure that the worker has the programs of an operator; they are compiled in one process only."""
+        if identity in self._installed:
+            return
+        self._installed.add(identity)
+        numbers = tuple(id(program) for program in programs)
+        missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
+        self._sent.update(missing)
+        self._send(Install(identity, numbers, missing))
+
+    def await_ready(self) -> bool:
+        """Waits until it can take batches; False when it ended before."""
+        try:
+            pickle.load(self._pipe_from())
+        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+            return False
+        return True
+
+    def _pipe_from(self) -> BinaryIO:
+        assert self._process.stdout is not None
+        return self._process.stdout  # type: ignore[return-value]
+
+    def _send(self, message: Any) -> None:
+        assert self._process.stdin is not None
+        pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
+        self._process.stdin.flush()
+
+    def run(self, batch: Batch) -> Outcome:
+        """Runs one batch there. Raises what the worker raised, or RuntimeError when it is gone."""
+        try:
+            self._send(batch)
+            answer = pickle.load(self._pipe_from())
+        except (EOFError, OSError) as error:
+            raise RuntimeError(f"a worker process ended: {error}") from error
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._process.kill()
+        self._process.wait()
+        # Its pipes are closed here so that no file is left to the garbage collector.
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                try:
+                    pipe.close()
+                except OSError:
+                    pass
+
+
+def serve(source: BinaryIO, sink: BinaryIO) -> None:
+    """Answers messages until the source ends."""
+
+    def answer(message: Any) -> None:
+        pickle.dump(message, sink, protocol=pickle.HIGHEST_PROTOCOL)
+        sink.flush()
+
+    setup: Setup = pickle.load(source)
+    problem = load_problem(setup.scene, setup.instance)
+    runner = BatchRunner(problem, setup.seed, setup.settings, setup.tolerances)
+    answer("ready")
+    loaded: dict[int, Program] = {}
+    while True:
+        try:
+            message: Install | Batch = pickle.load(source)
+        except EOFError:
+            return
+        try:
+            if isinstance(message, Install):
+                loaded |= {number: load_portable(data) for number, data in message.programs.items()}
+                runner.install(message.identity, [loaded[number] for number in message.numbers])
+            else:
+                answer(runner.run(message))
+        except Exception as error:  # noqa: BLE001 - sent to the process that asked
+            answer(error)
+
+
+def main() -> None:
+    """Serves standard input until it ends."""
+    # Ctrl-C reaches the whole group; the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sink = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    # Whatever else is printed must not end up among the answers.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    serve(sys.stdin.buffer, sink)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    # The messages' classes are those of the imported module, not of this one under another name.
+    from cgs_jax import worker
+
+    worker.main()
