@@ -369,7 +369,7 @@ def compile_while_sampling(scene: str, instance: int) -> dict[str, Any]:
     """The work of `compile_all`, in this process."""
     from cgs_jax import enable_disk_cache, load_problem
     from cgs_jax.programs import all_requested
-    from cgs_jax.sampler import Compiled, Found, Sampler, Started
+    from cgs_jax.sampler import Found, Sampler, Started
 
     began = time.perf_counter()
     enable_disk_cache()
@@ -378,20 +378,19 @@ def compile_while_sampling(scene: str, instance: int) -> dict[str, Any]:
     problem = load_problem(scene, instance)
     sampler = Sampler(problem, make_chooser(problem))
     loaded = time.perf_counter() - began
-    programs: list[tuple[str, float]] = []
     first, samples, ready = 0.0, 0, 0.0
     for event in sampler.events(600.0):
-        if isinstance(event, Compiled):
-            programs.append((event.name, event.seconds))
-        elif isinstance(event, Started):
+        if isinstance(event, Started):
             ready = time.perf_counter() - began
         elif isinstance(event, Found):
             samples += len(event.qpos)
             first = first or time.perf_counter() - began
         if ready and all(future.done() for future in all_requested()):
             break
+    seconds = time.perf_counter() - began
+    programs = [(program.name, program.seconds) for program in (future.result() for future in all_requested())]
     return {
-        "seconds": time.perf_counter() - began,
+        "seconds": seconds,
         "loaded": loaded,
         "first_operators": ready,
         "first_sample": first or None,
