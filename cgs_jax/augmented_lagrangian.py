@@ -174,7 +174,7 @@ def _weighted_rows(jacobian: jax.Array, weights: jax.Array) -> jax.Array:
 
 
 def _damped_least_norm(jacobian: jax.Array, residual: jax.Array, damping: jax.Array) -> jax.Array:
-    """`J^T (J J^T + mu I)^-1 d` per lane: jacobian `(m, n, lanes)`, residual `(m, lanes)`, damping `(lanes,)` -> `(n, lanes)`."""
+    """`J^T (J J^T + mu I)^-1 d` per lane: `(m, n, lanes)`, residual `(m, lanes)`, damping `(lanes,)` -> `(n, lanes)`."""
     m, n, _ = jacobian.shape
     gram = damping * jnp.eye(m, dtype=jacobian.dtype)[..., None]
     for i in range(n):

@@ -292,12 +292,16 @@ class Operator:
     def numbers(self, params: Params) -> Numbers:
         """The unchanging arguments of `propose`."""
         layout, plan = self.plan.layout, self.plan
-        chains = [padded(params.chains[name], layout.joints) for names in plan.tools for name in self._filled(names)]
+        chains = [
+            padded(params.chains[name] if name else _NO_CHAIN, layout.joints)
+            for names in plan.tools
+            for name in self._filled(names)
+        ]
         limits = [params.limits[name] for name in plan.configurations]
         tables = [params.tables[name] for name in self.tables]
         size = tables[0].configurations.shape[-1] if tables else 1
         tools = [
-            table.tools[name]
+            table.tools[name] if name else _still_tool(size)
             for table, names in zip(tables, plan.tools, strict=True)
             for name in self._filled(names)
         ]
@@ -327,8 +331,8 @@ class Operator:
         )
 
     def _filled(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Each configuration has the layout's number of tools; spare ones repeat the first."""
-        return names + names[:1] * (self.plan.layout.chains - len(names))
+        """Each configuration has the layout's number of tools; spare ones ("") do not move."""
+        return names + ("",) * (self.plan.layout.chains - len(names))
 
     def _choices(self, params: Params) -> SiteChoices:
         """Sites per site register, padded to the most that any constraint of the problem offers."""
@@ -354,6 +358,16 @@ class Operator:
             for k, (name, dof) in enumerate(zip(self.plan.configurations, self.dofs, strict=True))
         }
         return values | {name: proposals.poses[i] for i, name in enumerate(self.plan.poses)}
+
+
+_NO_CHAIN = Chain(
+    np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0), np.eye(3), np.zeros(3)
+)
+"""A tool that does not move, for a configuration that no product mentions."""
+
+
+def _still_tool(size: int) -> Pose:
+    return Pose(np.tile(np.eye(3, dtype=np.float32)[..., None], size), np.zeros((3, size), np.float32))
 
 
 def _stack(parts: list) -> Any:

@@ -177,8 +177,9 @@ def make_plan(
     """Plans the conditional problem of `new` variables under active constraints.
 
     `dofs` has each configuration variable's number of joints, None for a pose; `lengths` the joints of each chain; `joints`
-    and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). Poses are defined greedily: configurations are taken one by one, always the
-    one that completes most products; where every loop left has two or more unknown poses, one of them becomes free.
+    and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). Poses are
+    defined greedily: configurations are taken one by one, always the one that completes most products; where every loop left
+    has two or more unknown poses, one of them becomes free.
     """
     new_poses = [name for name in new if dofs[name] is None]
     new_configurations = [name for name in new if dofs[name] is not None]
@@ -322,7 +323,7 @@ class _Assembler:
                 given[Term(term.kind, term.name, term.variable)] = None
         chains = max([len(names) for names in tools.values()], default=1) or 1
         words = max(len(products), len(self.order) + len(self.free), 1)
-        first_tool = 1 + _rounded(max(len(given), 1), 6) + self.sites
+        first_tool = 1 + _rounded(max(len(given), 1), 12) + self.sites
         atoms: dict[Term, int] = {term: 1 + i for i, term in enumerate(given)}
         atoms |= {Term("site", name): first_tool - self.sites + i for i, name in enumerate(sites)}
         for k, name in enumerate(self.order):
@@ -342,8 +343,8 @@ class _Assembler:
             given=first_tool - self.sites - 1,
             sites=self.sites,
             length=_rounded(max([len(product) for product in products + outputs], default=1), 12),
-            tool_places=_rounded(len(of_configurations), 2 * words) if self.order else 0,
-            free_places=_rounded(len(of_free), words) if self.free else 0,
+            tool_places=_rounded(len(of_configurations), 4 * words) if self.order else 0,
+            free_places=_rounded(len(of_free), 4 * words) if self.free else 0,
             constraints=_rounded(len(constraints), 16),
             functions=tuple(
                 FunctionSlot(f, tuple(self._argument(v) for v in f.scope), constraints.index(name))

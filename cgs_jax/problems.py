@@ -337,11 +337,11 @@ class _Builder:
             self.add_rows("Position", product, form, low=placement.low, high=placement.high, wanted=wanted)
         for hold in task.holds:
             ends = [hold.start] if hold.supports else [hold.start, hold.end]
-            for switch in ends:
-                if self.sources[hold.object, switch] == ("held", hold.variable):
+            for end in ends:
+                if self.sources[hold.object, end] == ("held", hold.variable):
                     continue
-                left = (*self.frame_pose(hold.robot, hold.frame, switch), Term("pose", hold.variable))
-                self.add_rows("Kin", (*left, *inverted(self.object_pose(hold.object, switch))), "closed")
+                left = (*self.frame_pose(hold.robot, hold.frame, end), Term("pose", hold.variable))
+                self.add_rows("Kin", (*left, *inverted(self.object_pose(hold.object, end))), "closed")
         for goal in task.goals:
             if goal.full:
                 continue

@@ -105,7 +105,7 @@ def _stored(path: Path | None) -> Program | None:
 class Program:
     """One compiled program and what it took to make it."""
 
-    def __init__(self, name: str, executable: Callable, seconds: float, portable: bytes | None = None) -> None:
+    def __init__(self, name: str, executable: Any, seconds: float, portable: bytes | None = None) -> None:
         self.name, self.seconds = name, seconds
         self._executable = executable
         self._portable = portable

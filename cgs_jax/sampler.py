@@ -343,7 +343,9 @@ class Sampler:
                 if num_samples is not None and found >= num_samples:
                     reason = "samples"
                     break
-                while len(in_flight) < crew.size:
+                # What is decided must not depend on when the workers arrive.
+                most = self.settings.workers if self.settings.deterministic else crew.size
+                while len(in_flight) < most:
                     job = self._next_job()
                     if job is None:
                         break
@@ -483,7 +485,7 @@ class Sampler:
 
     # -------------------------------------------------------------- results
 
-    def _absorb(self, job: _Job, outcome: _Outcome, elapsed: float) -> Iterator[Event]:
+    def _absorb(self, job: _Job, outcome: Outcome, elapsed: float) -> Iterator[Event]:
         success = outcome.success
         given_up = ~success
         if job.step.reads:

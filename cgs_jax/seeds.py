@@ -224,7 +224,9 @@ def _fetch(table: jax.Array, start: jax.Array) -> jax.Array:
     return lax.fori_loop(0, start.shape[0], copy, jnp.zeros((table.shape[0], start.shape[0], CANDIDATES), table.dtype))
 
 
-def _around(words: Words, word: jax.Array, first: jax.Array, count: int, atoms: Pose) -> tuple[Pose, Pose, jax.Array, jax.Array]:
+def _around(
+    words: Words, word: jax.Array, first: jax.Array, count: int, atoms: Pose
+) -> tuple[Pose, Pose, jax.Array, jax.Array]:
     """A word as before * tool * after for the tool atoms `first` to `first + count - 1`.
 
     Returns both products `(3, 3, lanes)`, the tool's number (-1: it does not occur) and whether it is inverted. A second

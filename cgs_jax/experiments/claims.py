@@ -281,7 +281,7 @@ def _coverage(scene: Mapping[str, Any]) -> list[Claim]:
     means, open_means = {}, {}
     for method in scene["sequences"]:
         ratios = {v: measures.relative_to_tree(instances, v, method, "cells_at_equal_time") for v in scene["variables"]}
-        means[method] = float(np.mean([np.mean(r) for r in ratios.values() if r] or [0.0]))
+        means[method] = float(np.mean([float(np.mean(r)) for r in ratios.values() if r] or [0.0]))
         unsaturated = [v for v in ratios if all(i["variables"][v]["fill_as_wanted"] for i in instances) and ratios[v]]
         open_means[method] = float(np.mean([np.mean(ratios[v]) for v in unsaturated])) if unsaturated else None
     joint = next(iter(scene["sequences"]))

@@ -59,14 +59,13 @@ def time_of_overtaking(ours: Floats, theirs: Floats, times: Floats) -> float | N
 
 def ratio_with_interval(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, float | None]:
     """Mean over mean with a bootstrap interval over seeds; all None where theirs is 0 (nothing to compare with)."""
-    ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
-    if not theirs.mean() > 0:
+    above, below = np.asarray(ours, float), np.asarray(theirs, float)
+    if not below.mean() > 0:
         return {"ratio": None, "low": None, "high": None}
-    if (theirs > 0).all():
-        low, high = bootstrap_interval(ours, theirs, statistic=ratio_of_means)
-    else:  # a resample of theirs can be all zeros
-        low = high = float(ours.mean() / theirs.mean())
-    return {"ratio": float(ours.mean() / theirs.mean()), "low": low, "high": high}
+    ratio = float(above.mean() / below.mean())
+    # A resample of what they did can be all zeros.
+    low, high = bootstrap_interval(above, below, statistic=ratio_of_means) if (below > 0).all() else (ratio, ratio)
+    return {"ratio": ratio, "low": low, "high": high}
 
 
 def mean_with_interval(values: Sequence[float]) -> dict[str, float]:

@@ -185,7 +185,7 @@ def covering_sequences(transitions: Transitions) -> list[Path]:
         states[transition.target] = None
     ordered = sorted(states, key=len, reverse=True)
     seen: set = set()
-    paths = []
+    paths: list = []
     while True:
         best: dict[frozenset, tuple[int, Path]] = {transitions.full: (0, ())}
         for state in ordered:
