@@ -64,9 +64,13 @@ def _environment() -> str:
     return digest.hexdigest()
 
 
+def _jax_caches() -> bool:
+    return bool(jax.config.values.get("jax_compilation_cache_dir"))
+
+
 def _entry(key: str | None, shapes: tuple) -> Path | None:
     """File of a program in the cache; None where it is not to be cached."""
-    if key is None or _folder is None:
+    if key is None or _folder is None or _jax_caches():
         return None
     text = f"{_environment()} {key} {_signature(shapes)}"
     return _folder / f"{hashlib.sha256(text.encode()).hexdigest()}.program"
@@ -107,6 +111,8 @@ class Program:
 
     def __init__(self, name: str, executable: Any, seconds: float, portable: bytes | None = None) -> None:
         self.name, self.seconds = name, seconds
+        self.reported = False
+        """Whether a run has counted its compile seconds."""
         self._executable = executable
         self._portable = portable
 
@@ -115,9 +121,12 @@ class Program:
         return jax.block_until_ready(self._executable(*arguments))
 
     @property
-    def portable(self) -> bytes:
-        """The compiled program, to be loaded by another process on this machine (`load_portable`)."""
-        if self._portable is None:
+    def portable(self) -> bytes | None:
+        """The compiled program, to be loaded by another process on this machine (`load_portable`).
+
+        None where JAX keeps a cache of its own: what comes out of that cannot be serialised again.
+        """
+        if self._portable is None and not _jax_caches():
             self._portable = pickle.dumps((self.name, serialize_executable.serialize(self._executable)))
         return self._portable
 
@@ -165,6 +174,6 @@ def _make(name: str, function: Any, shapes: tuple, key: str | None) -> Program:
     start = time.perf_counter()
     executable = function.lower(*shapes).compile()
     program = Program(name, executable, time.perf_counter() - start)
-    if path is not None:
+    if path is not None and program.portable is not None:
         _store(path, program.portable)
     return program

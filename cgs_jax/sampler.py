@@ -155,7 +155,15 @@ class _Job:
     step: _Step
     batch: Batch
     tries: np.ndarray  # (n,) earlier tries of each condition
+    look: bool
+    """Whether it is one of the first batches in its place."""
 
+
+BATCH_SECONDS = 0.04
+"""Device time that a batch should take."""
+
+FIRST_GUESS = 4e-7
+"""Device seconds per task and squared unknown, before an operator has run."""
 
 TRIES = 0
 """Name under which the number of earlier tries travels with a waiting condition (no variable can be called that)."""
@@ -216,8 +224,10 @@ class _Crew:
 
         threading.Thread(target=arrive, daemon=True).start()
 
-    def run(self, batch: Batch) -> Outcome:
-        """Runs a batch on whoever is free."""
+    def run(self, batch: Batch, look: bool) -> Outcome:
+        """Runs a batch on whoever is free; a first look at an operator here, where its programs are loaded already."""
+        if look:
+            return self._local.run(batch)
         member = self._free.get()
         # With all workers there, this process has its core for compiling and deciding.
         if member is self._local and self._workers and self._arrived == self._wanted:
@@ -258,6 +268,7 @@ class Sampler:
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
+        self._pace: dict[int, float] = {}
         self._announced: set[int] = set()
         self._full = problem.transitions.full
         self._stop = threading.Event()
@@ -349,7 +360,7 @@ class Sampler:
                     job = self._next_job()
                     if job is None:
                         break
-                    future = threads.submit(crew.run, job.batch)
+                    future = threads.submit(crew.run, job.batch, job.look)
                     future.add_done_callback(lambda _: done.put(None))
                     in_flight.append((job, future))
                 yield from self._announcements()
@@ -426,7 +437,10 @@ class Sampler:
             if id(future) not in self._announced and future.done():
                 self._announced.add(id(future))
                 program = future.result()
-                yield Compiled(program.name, program.seconds)
+                # Programs made for an earlier run in this process cost this one nothing.
+                if not program.reported:
+                    program.reported = True
+                    yield Compiled(program.name, program.seconds)
 
     def _next_job(self) -> _Job | None:
         if self.settings.deterministic:
@@ -449,18 +463,29 @@ class Sampler:
             waiting = self._waiting.setdefault(slot, Pool())
             # A sequence that is new is followed down with small batches: what it is worth shows only at its end.
             young = self._visits.get(slot, 0) < 2
-            enough = batch // 16 if young else batch // 4
+            most = self._affordable(step.operator)
+            if young:
+                most = max(most // 8, min(16, batch))
+            enough = max(most // (2 if young else 4), 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
-                count = batch // 8 if young else batch
+                count = most
                 self._visits[slot] = self._visits.get(slot, 0) + 1
-                return self._job(path, position, step, waiting, count)
+                return self._job(path, position, step, waiting, count, young)
             position = makers[scarcest]
+
+    def _affordable(self, operator: Operator) -> int:
+        """Tasks of a batch that takes about `BATCH_SECONDS`: a look at a slow operator must not cost more than at others."""
+        pace = self._pace.get(operator.identity)
+        if pace is None:
+            # Before the first batch: the work of an iteration grows with the square of the unknowns.
+            pace = FIRST_GUESS * max(operator.plan.layout.unknowns, 1) ** 2
+        return int(min(self.settings.batch_size, max(BATCH_SECONDS / pace, 32)))
 
     def _pool(self, history: History) -> Pool:
         return self._pools.setdefault(history, Pool())
 
-    def _job(self, path: Path, position: int, step: _Step, waiting: Pool, most: int) -> _Job:
+    def _job(self, path: Path, position: int, step: _Step, waiting: Pool, most: int, look: bool) -> _Job:
         if not step.reads:
             conditions: Values = {}
             count, tries = most, np.zeros(most, np.int32)
@@ -481,7 +506,7 @@ class Sampler:
         first = self._tasks.get(step.operator.identity, 0)
         self._tasks[step.operator.identity] = first + count
         completes = step.transition.target == self._full and not self._final_histories(path)
-        return _Job(path, position, step, Batch(step.transition, conditions, count, first, completes), tries)
+        return _Job(path, position, step, Batch(step.transition, conditions, count, first, completes), tries, look)
 
     # -------------------------------------------------------------- results
 
@@ -512,13 +537,15 @@ class Sampler:
             host_seconds=outcome.host_seconds,
         )
         audited = outcome.audited
+        pace, known = outcome.device_seconds / len(success), self._pace.get(job.step.operator.identity)
+        self._pace[job.step.operator.identity] = pace if known is None else 0.7 * known + 0.3 * pace
         self.chooser.record(
             job.path[: job.position],
             job.step.transition,
             conditions=int((success | given_up).sum()),
             successes=int(success.sum()) if audited is None else len(audited.qpos),
             seconds=outcome.device_seconds,
-            visits=max(len(success) / self.settings.batch_size, 0.1),
+            visits=1.0,
             attempts=len(success),
         )
         if audited is not None:

@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+from cgs_jax.programs import enable_disk_cache
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -10,9 +12,7 @@ def pytest_configure(config):
     folder = config.cache.mkdir("compiled")
     # Commands under test keep their programs below XDG_CACHE_HOME; the tests' own process uses the same folder.
     os.environ["XDG_CACHE_HOME"] = str(folder)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "cgs_jax")
-    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(512 * 2**20)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+    enable_disk_cache()
     # Commands run with the package that is tested, installed or not.
     known = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *([known] if known else [])])
