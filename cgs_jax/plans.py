@@ -343,8 +343,8 @@ class _Assembler:
             given=first_tool - self.sites - 1,
             sites=self.sites,
             length=_rounded(max([len(product) for product in products + outputs], default=1), 12),
-            tool_places=_rounded(len(of_configurations), 4 * words) if self.order else 0,
-            free_places=_rounded(len(of_free), 4 * words) if self.free else 0,
+            tool_places=_rounded(max(len(of_configurations), 1), 4 * words) if self.order else 0,
+            free_places=_rounded(max(len(of_free), 1), 4 * words) if self.free else 0,
             constraints=_rounded(len(constraints), 16),
             functions=tuple(
                 FunctionSlot(f, tuple(self._argument(v) for v in f.scope), constraints.index(name))

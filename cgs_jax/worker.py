@@ -2,7 +2,7 @@
 
 XLA's CPU client shares one thread pool among all programs of a process and splits every program over it, which costs up to
 half of the machine for programs as small as ours. A process with a pool of one thread each (`NPROC=1`) does not pay that. A
-worker is this module run with `-m`; it reads pickled messages from its standard input and answers on its standard output. It
+worker is a process that runs `main`; it reads pickled messages from its standard input and answers on its standard output. It
 loads the scene by name, so only problems that `load_problem` made can be sent (see `Problem.source`).
 """
 
@@ -51,7 +51,8 @@ class Worker:
 
     def __init__(self, setup: Setup) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "cgs_jax.worker"],
+            # Not -m: the messages' classes must be those of the imported module.
+            [sys.executable, "-c", "from cgs_jax.worker import main; main()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
@@ -149,10 +150,3 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     serve(sys.stdin.buffer, sink)
     os._exit(0)
-
-
-if __name__ == "__main__":
-    # The messages' classes are those of the imported module, not of this one under another name.
-    from cgs_jax import worker
-
-    worker.main()
