@@ -162,8 +162,17 @@ class _Job:
 BATCH_SECONDS = 0.04
 """Device time that a batch should take."""
 
-FIRST_GUESS = 4e-7
-"""Device seconds per task and squared unknown, before an operator has run."""
+LOOKS = 8
+"""Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
+
+FIRST_GUESS = 6e-8
+"""Device seconds per task or iteration and squared unknown, before anything has run."""
+
+LEAST_UNKNOWNS = 7
+"""Programs with fewer unknowns than an arm has joints take as long as if they had so many: copies and clearances remain."""
+
+REPRESENTATIVE = 256
+"""Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
 
 TRIES = 0
 """Name under which the number of earlier tries travels with a waiting condition (no variable can be called that)."""
@@ -187,6 +196,42 @@ class SamplerSettings:
     """Same seed, same stream of samples: decisions use counted work in place of measured time."""
     solver: Settings = Settings()
     """Settings of the projection."""
+
+
+class _Pace:
+    """What counted work costs: device seconds per task or iteration of each program, as its larger batches showed.
+
+    The measured time of a small batch says little of what the operator would cost if it were chosen: lanes stand empty, and
+    on a busy machine one wait weighs more than the work. A program that only ran small batches is judged by what others
+    cost, in proportion to its squared number of unknowns.
+    """
+
+    def __init__(self) -> None:
+        self._programs: dict[Any, float] = {}  # seconds per unit of work and squared unknown
+        self._all = 0.0
+        self._work_per_task: dict[int, float] = {}
+
+    def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float) -> float:
+        """Device seconds to charge for a batch, whose measured time is taken into account."""
+        program, work = operator.plan.layout, (tasks + iterations) * _squared_unknowns(operator)
+        if tasks >= REPRESENTATIVE:
+            unit, known = measured / work, self._programs.get(program)
+            self._programs[program] = unit if known is None else 0.9 * known + 0.1 * unit
+            self._all = 0.9 * self._all + 0.1 * unit if self._all else unit
+        known = self._work_per_task.get(operator.identity, work / tasks)
+        self._work_per_task[operator.identity] = 0.7 * known + 0.3 * work / tasks
+        unit = self._programs.get(program, self._all)
+        return unit * work if unit else measured
+
+    def seconds_per_task(self, operator: Operator) -> float:
+        """Expected device seconds per task of a large batch."""
+        # Before its first batch: about seven iterations.
+        work = self._work_per_task.get(operator.identity, 8.0 * _squared_unknowns(operator))
+        return work * (self._programs.get(operator.plan.layout, self._all) or FIRST_GUESS)
+
+
+def _squared_unknowns(operator: Operator) -> int:
+    return max(operator.plan.layout.unknowns, LEAST_UNKNOWNS) ** 2
 
 
 class _Crew:
@@ -268,7 +313,7 @@ class Sampler:
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
-        self._pace: dict[int, float] = {}
+        self._pace = _Pace()
         self._announced: set[int] = set()
         self._full = problem.transitions.full
         self._stop = threading.Event()
@@ -462,10 +507,11 @@ class Sampler:
             slot = step.makes
             waiting = self._waiting.setdefault(slot, Pool())
             # A sequence that is new is followed down with small batches: what it is worth shows only at its end.
-            young = self._visits.get(slot, 0) < 2
+            visits = self._visits.get(slot, 0)
+            young = visits < 2
             most = self._affordable(step.operator)
-            if young:
-                most = max(most // 8, min(16, batch))
+            if visits < LOOKS:
+                most = max(most * (visits + 1) // LOOKS, min(16, batch))
             enough = max(most // (2 if young else 4), 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
@@ -476,11 +522,8 @@ class Sampler:
 
     def _affordable(self, operator: Operator) -> int:
         """Tasks of a batch that takes about `BATCH_SECONDS`: a look at a slow operator must not cost more than at others."""
-        pace = self._pace.get(operator.identity)
-        if pace is None:
-            # Before the first batch: the work of an iteration grows with the square of the unknowns.
-            pace = FIRST_GUESS * max(operator.plan.layout.unknowns, 1) ** 2
-        return int(min(self.settings.batch_size, max(BATCH_SECONDS / pace, 32)))
+        affordable = BATCH_SECONDS / self._pace.seconds_per_task(operator)
+        return int(min(self.settings.batch_size, max(affordable, 32)))
 
     def _pool(self, history: History) -> Pool:
         return self._pools.setdefault(history, Pool())
@@ -537,16 +580,19 @@ class Sampler:
             host_seconds=outcome.host_seconds,
         )
         audited = outcome.audited
-        pace, known = outcome.device_seconds / len(success), self._pace.get(job.step.operator.identity)
-        self._pace[job.step.operator.identity] = pace if known is None else 0.7 * known + 0.3 * pace
+        operator = job.step.operator
+        seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds)
+        allowed = self.settings.tries if job.step.reads else 1
+        attempts = np.bincount(job.tries, minlength=allowed)
+        successes = np.bincount(job.tries[success], minlength=allowed)
+        if audited is not None and audited.rejected:
+            successes[successes.argmax()] -= min(audited.rejected, successes.max())
         self.chooser.record(
             job.path[: job.position],
             job.step.transition,
-            conditions=int((success | given_up).sum()),
-            successes=int(success.sum()) if audited is None else len(audited.qpos),
-            seconds=outcome.device_seconds,
-            visits=1.0,
-            attempts=len(success),
+            attempts=attempts.tolist(),
+            successes=successes.tolist(),
+            seconds=seconds,
         )
         if audited is not None:
             yield self._found(audited, job.path, elapsed)

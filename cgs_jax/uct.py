@@ -1,12 +1,19 @@
 """Which conditional operator to run next: upper confidence trees over assignment sequences (paper, Section IV-A).
 
-Nodes are sequences of transitions, as in the paper. What differs from plain UCT, and why:
+What differs from plain UCT, and why:
 
-* Successes and time are counted apart, per edge of the tree and pooled per conditional problem, and the value Q is
-  formed from them when it is needed. A mixture of both made at yesterday's price of time would go stale.
+* Successes and time are counted apart and the value Q is formed from them when it is needed. A mixture of both made at
+  yesterday's price of time would go stale.
 * Q is a model-based backup: an edge's success times the best value behind it. Sampled returns need far more rollouts.
-* Visits are counted in batches. Q is normalised between the least and the greatest among siblings, so that `c_uct`
-  does not depend on the unit of time.
+* What an operator meets depends on how the variables that it reads came about, and on nothing else. Statistics belong to
+  that *history*: an operator with the histories of the components that it reads. Sequences that differ only in the order
+  of independent steps share their histories and meet in one node (a transposition).
+* A history of which little is known borrows from its operator's pooled statistics. With what weight is learned too: where
+  histories do not matter a lot, where the operator succeeds four times as often after one as after another very little.
+* A condition may be tried several times. Those that still wait for another try are censored observations: success is
+  counted per try, and success within all tries follows by the product of Kaplan and Meier (1958).
+* Visits are counted in batches. Q is normalised among siblings by what the best of them could gain, so that `c_uct`
+  depends neither on the unit of time nor on how rare samples are.
 
 The reward is the paper's lambda * r_t + (1 - lambda) * r_g with lambda = 1/(c + 1), divided by (1 - lambda): success
 minus time * price, price = 1/c. With c the cost per *finished sample* this is Dinkelbach's rule, whose maximum is the
@@ -17,67 +24,133 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
 from cgs_jax.errors import InputError
 from cgs_jax.transitions import Problem, State, Transition, Transitions
 
-SCHEMA = "cgs_jax.tree/1"
+SCHEMA = "cgs_jax.tree/2"
 
 Path = tuple[Transition, ...]
 Ready = Callable[[Transition], bool]
+Counts = int | Sequence[int]
 
-PRIOR_CONDITIONS = 2.0
-"""Weight of the prior of an operator without statistics, in conditions."""
+PRIOR_TRIES = 2.0
+"""Weight of the prior of an operator without statistics, in tries."""
 
 PRIOR_SUCCESS = 0.7
 """Guessed success of an operator that never ran, per new variable."""
 
-OPERATOR_WEIGHT = 300.0
-"""An edge believes its operator's pooled statistics as if they were at most this many conditions of its own."""
+CORRELATION = 0.03
+"""Guess of how much of the variance of success lies between the histories of an operator (`_Records._trust`)."""
+
+CORRELATION_TRIES = 1000.0
+"""Weight of that guess, in tries."""
+
+OPERATOR_TIME_TRIES = 300.0
+"""The same for the time of a try, which varies less from history to history."""
+
+VISIT_TRIES = 32
+"""Smaller batches count as visits in proportion."""
+
+NEXT_TRY = 30.0
+"""Weight, in tries, of the belief that a further try succeeds as often as the one before."""
 
 ENUMERABLE = 3000
 """Up to this many transitions the values below the tree come from dynamic programming over all states."""
 
 UNTRIED_VISITS = 1.0
-"""Where there are more, an operator that was never tried counts as visited this often instead of never: trying
-thousands of them first would leave no time to use any. Its bonus still grows without bound."""
+"""What was never tried counts as visited this often, instead of never, while the share below is used up or where there
+are more transitions than could be tried first. Its bonus still grows without bound."""
+
+HOPE = 0.5
+"""In the search success is taken for its mean plus this many standard deviations, by what is known of the history."""
+
+CURIOSITY = 0.1
+"""First trials of operators come first, smallest first, up to this share of the device time."""
 
 
 @dataclass
 class Statistics:
-    """What happened on an edge, or pooled on an operator.
+    """What happened after a history, or pooled over the histories of an operator.
 
-    visits: batches. conditions: distinct conditioning prefixes that were consumed, each having succeeded or been given
-    up. successes: those that succeeded. attempts: tries in total. seconds: device time. All but visits are discounted:
-    they are weights of evidence, not counts.
+    visits: batches. attempts, successes: of first tries, of second ones, and so on. seconds: device time. All but visits
+    are discounted: they are weights of evidence, not counts.
     """
 
     visits: float = 0.0
-    conditions: float = 0.0
-    successes: float = 0.0
-    attempts: float = 0.0
+    attempts: list[float] = field(default_factory=list)
+    successes: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
-    def add(self, conditions: float, successes: float, attempts: float, seconds: float, visits: float, keep: float):
+    def add(self, visits: float, attempts: Sequence[float], successes: Sequence[float], seconds: float, keep: float = 1.0):
         """Discount what is known by the factor `keep` and add a batch."""
+        more = len(attempts) - len(self.attempts)
+        if more > 0:
+            self.attempts += [0.0] * more
+            self.successes += [0.0] * more
+        if keep != 1.0:
+            self.attempts = [keep * value for value in self.attempts]
+            self.successes = [keep * value for value in self.successes]
+        for k, value in enumerate(attempts):
+            self.attempts[k] += value
+        for k, value in enumerate(successes):
+            self.successes[k] += value
         self.visits += visits
-        self.conditions = keep * self.conditions + conditions
-        self.successes = keep * self.successes + successes
-        self.attempts = keep * self.attempts + attempts
         self.seconds = keep * self.seconds + seconds
 
     @property
+    def tries(self) -> float:
+        """Attempts, whichever try they were."""
+        return sum(self.attempts)
+
+    def hazards(self, prior: Sequence[float], weight: float) -> list[float]:
+        """Success of each try: the counts, and `prior` with a weight in tries."""
+        result: list[float] = []
+        for k in range(max(len(self.attempts), len(prior))):
+            if k < len(prior):
+                guess, trust = prior[k], weight
+            else:
+                guess, trust = result[-1], NEXT_TRY
+            if k < len(self.attempts):
+                guess = (self.successes[k] + trust * guess) / (self.attempts[k] + trust)
+            result.append(guess)
+        return result
+
+    @property
     def success_rate(self) -> float | None:
-        """Successes per condition; None without evidence."""
-        return self.successes / self.conditions if self.conditions else None
+        """Success per condition within its tries; None without evidence."""
+        return _within(self._observed)[0] if self._observed else None
 
     @property
     def seconds_per_condition(self) -> float | None:
-        return self.seconds / self.conditions if self.conditions else None
+        return _within(self._observed)[1] * self.seconds / self.tries if self._observed else None
+
+    @property
+    def seconds_per_try(self) -> float | None:
+        return self.seconds / self.tries if self.tries else None
+
+    @property
+    def _observed(self) -> list[float]:
+        """Success of each try that was made."""
+        return [s / a for a, s in zip(self.attempts, self.successes, strict=True) if a > 0]
+
+
+@dataclass
+class Totals:
+    """Of a whole run: batches, rollouts (attempts at the root), finished samples, device seconds, and those of first trials.
+
+    Rollouts, samples and seconds are discounted.
+    """
+
+    visits: float = 0.0
+    rollouts: float = 0.0
+    samples: float = 0.0
+    seconds: float = 0.0
+    first_trials: float = 0.0
 
 
 class Chooser(Protocol):
@@ -96,76 +169,122 @@ class Chooser(Protocol):
         self,
         prefix: Path,
         transition: Transition,
-        conditions: int,
-        successes: int,
+        attempts: Counts,
+        successes: Counts,
         seconds: float,
         visits: float = 1.0,
-        attempts: int | None = None,
     ) -> None: ...
 
 
 class _Operator:
     """Pooled statistics of one conditional problem, and what they predict."""
 
-    __slots__ = ("cost", "prior", "ready", "statistics", "success")
+    __slots__ = (
+        "cost", "guess", "hazards", "hopeful_cost", "hopeful_success", "prior", "ready", "seconds_per_try", "statistics",
+        "success",
+    )  # fmt: skip
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, guess: float) -> None:
         self.statistics = Statistics()
         self.ready = True
-        self.prior = self.success = PRIOR_SUCCESS ** len(problem[0])
-        self.cost = 0.0
+        self.prior = PRIOR_SUCCESS ** len(problem[0])
+        self.guess = guess  # seconds per try
+        self.predict(1.0 / CORRELATION - 1.0)
 
-    def predict(self, initial_cost: float) -> None:
+    def predict(self, trust: float) -> None:
+        """trust: weight of the pooled success in what is expected after a history, in tries."""
         known = self.statistics
-        weight = known.conditions + PRIOR_CONDITIONS
-        self.success = (known.successes + PRIOR_CONDITIONS * self.prior) / weight
+        self.hazards = known.hazards([self.prior], PRIOR_TRIES)
+        self.success, tries = _within(self.hazards)
         # The guessed cost counts only until a cost was seen: it may be wrong by orders of magnitude.
-        self.cost = known.seconds / known.conditions if known.conditions else initial_cost
+        self.seconds_per_try = known.seconds / known.tries if known.tries else self.guess
+        self.cost = tries * self.seconds_per_try
+        # After a history that was never tried.
+        self.hopeful_success, tries = _hopeful(self.hazards, trust)
+        self.hopeful_cost = tries * self.seconds_per_try
 
 
 class _Step:
     """A transition together with what it does to the independent components of the assigned variables.
 
-    kept: components that survive its failure. used: components that are consumed. made: the component of the result.
+    used: components that are consumed. made: the component of the result. All others survive its failure.
     """
 
-    __slots__ = ("kept", "made", "operator", "target", "transition", "used")
+    __slots__ = ("made", "operator", "target", "transition", "used")
 
-    def __init__(self, transition: Transition, operator: _Operator, components: tuple[State, ...]) -> None:
+    def __init__(self, transition: Transition, operator: _Operator, used: tuple[State, ...]) -> None:
         self.transition = transition
         self.operator = operator
         self.target = transition.target
-        self.used = tuple(c for c in components if c & transition.condition)
-        self.kept = tuple(c for c in components if not c & transition.condition)
-        self.made = frozenset(transition.new).union(*self.used)
+        self.used = used
+        self.made = frozenset(transition.new).union(*used)
+
+
+class _History:
+    """How a component came about: the operator that completed it and the histories that it read.
+
+    success, cost: expected, per condition. item_cost: expected device seconds per item of the component, with all that it
+    was made of. prefix: the sequence by which it was first made, None before.
+    """
+
+    __slots__ = (
+        "cost", "hopeful_cost", "hopeful_success", "item_cost", "made", "operator", "prefix", "reads", "statistics", "success",
+        "version",
+    )  # fmt: skip
+
+    def __init__(self, operator: _Operator, reads: tuple[_History, ...], made: State) -> None:
+        self.operator = operator
+        self.reads = reads
+        self.made = made
+        self.statistics = Statistics()
+        self.prefix: Path | None = None
+        self.success = self.cost = self.item_cost = self.hopeful_success = self.hopeful_cost = 0.0
+        self.version = -1
+
+    def predict(self, trust: float) -> None:
+        """trust: as for operators."""
+        operator, own = self.operator, self.statistics
+        if own.attempts:
+            hazards = own.hazards(operator.hazards, trust)
+            known = trust + own.attempts[0]
+            per_try = (own.seconds + OPERATOR_TIME_TRIES * operator.seconds_per_try) / (own.tries + OPERATOR_TIME_TRIES)
+        else:
+            hazards, known, per_try = operator.hazards, trust, operator.seconds_per_try
+        self.success, tries = _within(hazards)
+        self.cost = tries * per_try
+        self.hopeful_success, tries = _hopeful(hazards, known)
+        self.hopeful_cost = tries * per_try
+        self.item_cost = (sum(read.item_cost for read in self.reads) + self.cost) / max(self.success, 1e-12)
+
+
+class _Edge:
+    """A step out of a node, and the history that it makes there."""
+
+    __slots__ = ("history", "kept", "node", "quality", "reach", "step", "value")
+
+    def __init__(self, step: _Step, history: _History, kept: tuple[_History, ...]) -> None:
+        self.step = step
+        self.history = history
+        self.kept = kept
+        self.node: _Node | None = None
+        self.value = 0.0  # of what lies behind
+        self.quality = 0.0  # the paper's Q
+        self.reach = 0.0  # probability to finish from before the step on
 
 
 class _Node:
-    """A sequence of transitions: the last of them is `step` (None at the root).
+    """Assigned variables and how their components came about: all sequences that lead there."""
 
-    costs: expected device seconds per item of every component, produced the way this sequence does.
-    """
+    __slots__ = ("components", "edges", "reach", "state", "value", "version", "visited")
 
-    __slots__ = ("children", "costs", "expanded", "interior", "parent", "quality", "statistics", "step", "value")
-
-    def __init__(self, parent: _Node | None, step: _Step | None) -> None:
-        self.parent = parent
-        self.step = step
-        self.statistics = Statistics()
-        self.children: dict[tuple[str, ...], _Node] = {}
-        self.expanded = False  # all children are there
-        self.interior = False  # something was recorded on a child
-        self.costs: dict[State, float] = {}
+    def __init__(self, state: State, components: tuple[_History, ...]) -> None:
+        self.state = state
+        self.components = components
+        self.edges: dict[tuple[str, ...], _Edge] = {}  # all of them, or none yet
+        self.visited = False  # a recorded sequence passed through
         self.value = 0.0
-        self.quality = 0.0
-
-    @property
-    def path(self) -> Path:
-        path, node = [], self
-        while node.parent is not None:
-            path.append(node.step.transition)
-            node = node.parent
-        return tuple(reversed(path))
+        self.reach = 0.0
+        self.version = -1
 
 
 class _Records:
@@ -178,7 +297,7 @@ class _Records:
         transitions: Transitions,
         retain: bool = True,
         discount: float = 0.998,
-        initial_cost: float = 1e-4,
+        initial_cost: float = 2.5e-5,
     ) -> None:
         if not 0.0 < discount <= 1.0:
             raise InputError(f"discount is {discount}; expected above 0 and at most 1")
@@ -188,10 +307,15 @@ class _Records:
         self.retain = retain
         self.discount = discount
         self.initial_cost = initial_cost
-        self._root = _Node(None, None)
         self._operators: dict[Problem, _Operator] = {}
         self._steps: dict[State, dict[tuple[str, ...], _Step]] = {}
-        self._total = Statistics()  # of the whole run: conditions at the root, successes = finished samples
+        self._histories: dict[tuple, _History] = {}
+        self._known: list[_History] = []  # with statistics of their own
+        self._nodes: dict[frozenset[_History], _Node] = {}
+        self._root = self._node_of(frozenset(), ())
+        self._total = Totals()
+        self._version = 0  # of the predictions
+        self._trust = 1.0 / CORRELATION - 1.0
 
     # What happened
 
@@ -199,44 +323,55 @@ class _Records:
         self,
         prefix: Path,
         transition: Transition,
-        conditions: int,
-        successes: int,
+        attempts: Counts,
+        successes: Counts,
         seconds: float,
         visits: float = 1.0,
-        attempts: int | None = None,
     ) -> None:
         """One batch of `transition` after the sequence `prefix`.
 
-        conditions: distinct conditioning prefixes consumed, each succeeded or finally given up; successes: how many
-        succeeded; attempts: tries in total (default: one per condition); seconds: device time; visits: batches.
-        Raises InputError for impossible numbers and for a sequence that is none.
+        attempts, successes: how many first tries of a condition there were and how many of them succeeded, how many
+        second ones, and so on; a number stands for first tries alone. Their length tells how often a condition may be
+        tried. seconds: device time; visits: batches. Raises InputError for impossible numbers and for a sequence that is
+        none.
         """
-        if not 0 <= successes <= conditions or seconds < 0 or visits < 0:
+        attempts = [attempts] if isinstance(attempts, int) else list(attempts)
+        successes = [successes] if isinstance(successes, int) else list(successes)
+        possible = len(attempts) == len(successes) and all(0 <= s <= a for a, s in zip(attempts, successes))
+        if not possible or seconds < 0 or visits < 0:
             raise InputError(
-                f"record of {transition}: {successes} successes of {conditions} conditions in {seconds} s, {visits} "
-                "visits; expected 0 <= successes <= conditions and no negative number"
+                f"record of {transition}: {successes} successes of {attempts} attempts in {seconds} s, {visits} "
+                "visits; expected 0 <= successes <= attempts and no negative number"
             )
-        node = self._node((*prefix, transition))
+        lineage = self._follow((*prefix, transition))
+        history = lineage[-1].history
+        if not history.operator.statistics.visits:
+            self._total.first_trials += seconds
+        self._name(history, (*prefix, transition))
+        # A batch that hardly tells anything hardly counts as a visit.
+        visits *= min(1.0, sum(attempts) / VISIT_TRIES)
         keep = self.discount**visits
-        attempts = conditions if attempts is None else attempts
-        for statistics in (node.statistics, node.step.operator.statistics):
-            statistics.add(conditions, successes, attempts, seconds, visits, keep)
-        finished = successes if node.step.target == self.transitions.full else 0
-        self._total.add(0 if prefix else conditions, finished, 0, seconds, visits, keep)
-        self._recorded(node)
+        for statistics in (history.statistics, history.operator.statistics):
+            statistics.add(visits, attempts, successes, seconds, keep)
+        total = self._total
+        total.visits += visits
+        total.rollouts = keep * total.rollouts + (0 if prefix else sum(attempts))
+        total.samples = keep * total.samples + (sum(successes) if transition.target == self.transitions.full else 0)
+        total.seconds = keep * total.seconds + seconds
+        self._recorded(lineage)
 
-    def _recorded(self, node: _Node) -> None:
-        """Called after every record."""
+    def _recorded(self, lineage: list[_Edge]) -> None:
+        """Called after every record with the edges from the root."""
 
     @property
     def rate(self) -> float:
         """Finished samples per second of device time, both discounted."""
-        return self._total.successes / self._total.seconds if self._total.seconds else 0.0
+        return self._total.samples / self._total.seconds if self._total.seconds else 0.0
 
     @property
     def seconds_per_rollout(self) -> float | None:
-        """Device seconds per condition at the root, discounted; None before the first."""
-        return self._total.seconds / self._total.conditions if self._total.conditions else None
+        """Device seconds per attempt at the root, discounted; None before the first."""
+        return self._total.seconds / self._total.rollouts if self._total.rollouts else None
 
     def operator_statistics(self) -> dict[Problem, Statistics]:
         """Pooled statistics of every operator that ran or was warm started."""
@@ -247,7 +382,7 @@ class _Records:
     def predict_rate(self, path: Sequence[Transition]) -> float:
         """Predicted finished samples per second of device time when only this sequence is run.
 
-        Uses the statistics of its own prefixes where there are some, those of its operators otherwise, and a guess
+        Uses the statistics of its own histories where there are some, those of its operators otherwise, and a guess
         (PRIOR_SUCCESS at `initial_cost`) for an operator that never ran. Raises InputError for an incomplete sequence.
         """
         path = tuple(path)
@@ -255,14 +390,8 @@ class _Records:
         if state != self.transitions.full:
             missing = ", ".join(self.transitions.graph.ordered(self.transitions.full - state))
             raise InputError(f"sequence {self.transitions.format(path)!r} leaves {missing} unassigned")
-        node: _Node | None = self._root
-        costs: dict[State, float] = {}
-        for transition in path:
-            step = self._step(transition)
-            node = node.children.get(transition.new) if node else None
-            success, cost = self._posterior(step, node)
-            costs = _advance(costs, step, success, cost)
-        return 1.0 / max(sum(costs.values()), 1e-300)
+        self._predict_operators()
+        return self._rate_of(path)
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
         """The k sequences of greatest predicted rate, with that rate, out of operators that have run.
@@ -270,45 +399,76 @@ class _Records:
         On a small graph out of all sequences, on a large one out of those that were run to the end. The best ones may
         differ only in the order of independent steps, and then have equal rates.
         """
+        self._predict_operators()
         paths = self._cheapest_paths(k) if self._states is not None else self._finished_paths()
-        ranked = sorted(((path, self.predict_rate(path)) for path in paths), key=lambda pair: -pair[1])
+        ranked = sorted(((path, self._rate_of(path)) for path in paths), key=lambda pair: -pair[1])
         return ranked[:k]
+
+    def _rate_of(self, path: Path) -> float:
+        components: tuple[_History, ...] = ()
+        for transition in path:
+            history, kept = self._made_by(self._step(transition), components)
+            components = (*kept, history)
+        return 1.0 / max(sum(self._predicted(history).item_cost for history in components), 1e-300)
 
     def _finished_paths(self) -> list[Path]:
         full = self.transitions.full
-        return [node.path for node in self._visited() if node.step.target == full]
+        return [history.prefix for history in self._known if history.prefix[-1].target == full]
 
     def _cheapest_paths(self, k: int) -> list[Path]:
         """Forward search that keeps in every state the k partial sequences of least production cost."""
-        partial: dict[State, list[tuple[float, dict[State, float], _Node | None, Path]]]
-        partial = {state: [] for state in self._states}
-        partial[frozenset()] = [(0.0, {}, self._root, ())]
+        partial: dict[State, list[tuple[float, tuple[_History, ...], Path]]] = {state: [] for state in self._states}
+        partial[frozenset()] = [(0.0, (), ())]
         for state in self._states:
             labels = sorted(partial[state], key=lambda label: label[0])[:k]
             partial[state] = labels
             for step in self._steps_from(state).values():
                 if step.operator.statistics.visits <= 0:
                     continue
-                for _, costs, node, path in labels:
-                    child = node.children.get(step.transition.new) if node else None
-                    after = _advance(costs, step, *self._posterior(step, child))
-                    partial[step.target].append((sum(after.values()), after, child, (*path, step.transition)))
-        return [path for _, _, _, path in partial[self.transitions.full]]
+                for _, components, path in labels:
+                    history, kept = self._made_by(step, components)
+                    after = (*kept, history)
+                    cost = sum(self._predicted(component).item_cost for component in after)
+                    partial[step.target].append((cost, after, (*path, step.transition)))
+        return [path for _, _, path in partial[self.transitions.full]]
 
-    def _posterior(self, step: _Step, node: _Node | None) -> tuple[float, float]:
-        """Expected success and seconds per condition of an edge; its operator's statistics are the prior."""
-        operator = step.operator
-        operator.predict(self.initial_cost)
-        return self._blend(operator, node)
+    def _predict_operators(self) -> None:
+        """Renew what operators predict; histories follow when they are asked."""
+        self._trust = 1.0 / self._correlation() - 1.0
+        for operator in self._operators.values():
+            operator.predict(self._trust)
+        self._version += 1
 
-    def _blend(self, operator: _Operator, node: _Node | None) -> tuple[float, float]:
-        if node is None or not node.statistics.conditions:
-            return operator.success, operator.cost
-        own, weight = node.statistics, min(operator.statistics.conditions, OPERATOR_WEIGHT)
-        total = own.conditions + weight
-        return (own.successes + weight * operator.success) / total, (own.seconds + weight * operator.cost) / total
+    def _correlation(self) -> float:
+        """Share of the variance of a first try's success that lies between the histories of one operator.
 
-    # Nodes and steps
+        With success distributed over histories as a beta distribution, 1/share - 1 is the weight of its mean, in tries.
+        Estimated by moments over all operators: the squared deviations from their means beyond the binomial ones.
+        """
+        between, total = CORRELATION * CORRELATION_TRIES, CORRELATION_TRIES
+        for history in self._known:
+            own, pooled = history.statistics, history.operator.statistics
+            if own.attempts and own.attempts[0] > 1.0 and own.attempts[0] < pooled.attempts[0]:
+                tries, mean = own.attempts[0], pooled.successes[0] / pooled.attempts[0]
+                variance = mean * (1.0 - mean)
+                if variance > 0.0:
+                    deviation = (own.successes[0] / tries - mean) ** 2 / variance
+                    # No history counts for more than the guess.
+                    weight = min(tries, CORRELATION_TRIES)
+                    # The mean contains the history itself.
+                    between += weight * (deviation / (1.0 - tries / pooled.attempts[0]) - 1.0 / tries)
+                    total += weight
+        return min(max(between / total, 1e-3), 0.5)
+
+    def _predicted(self, history: _History) -> _History:
+        if history.version != self._version:
+            for read in history.reads:
+                self._predicted(read)
+            history.predict(self._trust)
+            history.version = self._version
+        return history
+
+    # Nodes, histories and steps
 
     @cached_property
     def _states(self) -> list[State] | None:
@@ -320,21 +480,26 @@ class _Records:
             states[transition.target] = None
         return sorted(states, key=lambda state: (len(state), self.transitions.graph.ordered(state)))
 
+    def _operator(self, problem: Problem) -> _Operator:
+        operator = self._operators.get(problem)
+        if operator is None:
+            # The work of a solve grows with the square of its unknowns, and those are mostly configurations.
+            kinds = [self.transitions.graph.variable(name).kind for name in problem[0]]
+            guess = self.initial_cost * max(kinds.count("configuration"), 1) ** 2
+            operator = self._operators[problem] = _Operator(problem, guess)
+        return operator
+
     def _steps_from(self, state: State) -> dict[tuple[str, ...], _Step]:
         """The kept transitions out of a state, by their new variables, in the order of children()."""
         steps = self._steps.get(state)
         if steps is None:
-            if self.retain:
-                components = self.transitions.graph.components(state)
-            else:
-                components = (state,) if state else ()  # one item: lost as a whole
+            components = self.transitions.graph.components(state) if self.retain else ((state,) if state else ())
             steps = self._steps[state] = {}
             for transition in self.transitions.children(state):
-                operator = self._operators.setdefault(transition.problem, _Operator(transition.problem))
-                step = _Step(transition, operator, components)
-                if not self.retain:
-                    step.used, step.kept, step.made = components, (), step.target
-                steps[transition.new] = step
+                operator = self._operator(transition.problem)
+                # Without pools there is one component, lost as a whole.
+                used = tuple(c for c in components if c & transition.condition) if self.retain else components
+                steps[transition.new] = _Step(transition, operator, used)
         return steps
 
     def _step(self, transition: Transition) -> _Step:
@@ -344,28 +509,54 @@ class _Records:
             raise InputError(f"{transition} is no kept transition at its state; available: {available}")
         return steps[transition.new]
 
-    def _node(self, path: Iterable[Transition]) -> _Node:
-        """The node of a sequence, made when it is new."""
-        node: _Node = self._root
-        state: State = frozenset()
-        for transition in path:
-            if transition.given != state:
-                raise InputError(f"{transition} does not follow {self.transitions.format(node.path) or 'the start'!r}")
-            child = node.children.get(transition.new)
-            if child is None:
-                child = node.children[transition.new] = _Node(node, self._step(transition))
-            node.interior = True
-            node, state = child, child.step.target
+    def _made_by(self, step: _Step, components: tuple[_History, ...]) -> tuple[_History, tuple[_History, ...]]:
+        """The history that a step makes out of components, and those that it leaves alone."""
+        reads = tuple(component for component in components if component.made in step.used)
+        kept = tuple(component for component in components if component.made not in step.used)
+        key = (step.operator, frozenset(reads))
+        history = self._histories.get(key)
+        if history is None:
+            history = self._histories[key] = _History(step.operator, reads, step.made)
+        return history, kept
+
+    def _node_of(self, state: State, components: tuple[_History, ...]) -> _Node:
+        key = frozenset(components)
+        node = self._nodes.get(key)
+        if node is None:
+            node = self._nodes[key] = _Node(state, components)
         return node
 
-    def _visited(self) -> Iterator[_Node]:
-        """Nodes with statistics of their own, parents first."""
-        stack = [self._root]
-        while stack:
-            node = stack.pop()
-            if node.statistics.visits > 0:
-                yield node
-            stack.extend(reversed(node.children.values()))
+    def _expand(self, node: _Node) -> list[_Edge]:
+        """All edges of a node in the order of the transitions."""
+        if not node.edges:
+            steps = self._steps_from(node.state)
+            node.edges = {new: _Edge(step, *self._made_by(step, node.components)) for new, step in steps.items()}
+        return list(node.edges.values())
+
+    def _behind(self, edge: _Edge) -> _Node:
+        if edge.node is None:
+            edge.node = self._node_of(edge.step.target, (*edge.kept, edge.history))
+        return edge.node
+
+    def _follow(self, path: Iterable[Transition]) -> list[_Edge]:
+        """The edges of a sequence from the root, made when they are new; nodes on the way count as visited."""
+        node = self._root
+        edges: list[_Edge] = []
+        for transition in path:
+            if transition.given != node.state:
+                so_far = self.transitions.format([edge.step.transition for edge in edges]) or "the start"
+                raise InputError(f"{transition} does not follow {so_far!r}")
+            self._step(transition)
+            self._expand(node)
+            node.visited = True
+            edges.append(node.edges[transition.new])
+            node = self._behind(edges[-1])
+        return edges
+
+    def _name(self, history: _History, prefix: Path) -> None:
+        if history.prefix is None:
+            history.prefix = prefix
+            self._known.append(history)
 
     # Files
 
@@ -373,7 +564,10 @@ class _Records:
         return {"retain": self.retain, "discount": self.discount, "initial_cost": self.initial_cost}
 
     def as_json(self) -> dict[str, Any]:
-        """Everything that was learned, readable, ready for json.dump. Schema "cgs_jax.tree/1"."""
+        """Everything that was learned, readable, ready for json.dump. Schema "cgs_jax.tree/2".
+
+        "sequences" has one entry per history, under the sequence by which it was first made.
+        """
         graph = self.transitions.graph
         return {
             "schema": SCHEMA,
@@ -388,54 +582,69 @@ class _Records:
                 for (new, constraints), statistics in self.operator_statistics().items()
             ],
             "sequences": [
-                {"sequence": self.transitions.format(node.path), **_described(node.statistics), **self._value_of(node)}
-                for node in self._visited()
+                {
+                    "sequence": self.transitions.format(history.prefix),
+                    **_described(history.statistics),
+                    **self._value_of(history),
+                }
+                for history in self._known
             ],
         }
 
-    def _value_of(self, node: _Node) -> dict[str, float]:
+    def _value_of(self, history: _History) -> dict[str, float]:
         return {}
 
-    def _load(self, data: dict[str, Any]) -> None:
-        operators = _operators_in(self.transitions, data)
-        self._total = Statistics(**data["totals"])
-        for problem, entry in operators.items():
-            self._operators.setdefault(problem, _Operator(problem)).statistics = _read_statistics(entry)
+    def add(self, data: dict[str, Any]) -> None:
+        """Adds the statistics of a tree file. Raises InputError for another schema or another graph."""
+        for problem, entry in _operators_in(self.transitions, data).items():
+            operator = self._operator(problem)
+            _add(operator.statistics, _read_statistics(entry))
         for entry in data["sequences"]:
-            self._node(_read_prefix(self.transitions, entry["sequence"])).statistics = _read_statistics(entry)
+            history = self._history_at(entry["sequence"])
+            _add(history.statistics, _read_statistics(entry))
+        for name, value in data["totals"].items():
+            setattr(self._total, name, getattr(self._total, name) + value)
+        self._predict_operators()
+
+    def _history_at(self, text: str) -> _History:
+        """The history that a partial sequence makes."""
+        prefix = _read_prefix(self.transitions, text)
+        history = self._follow(prefix)[-1].history
+        self._name(history, prefix)
+        return history
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         """Start from earlier instances of the same graph (paper, Section IV-C).
 
-        Per edge and per operator the average over the earlier instances of success and of seconds per condition, not
-        of Q: the price of time may be another one here. Weight: `n_equiv` visits, in batches of the mean size there,
-        but no more visits than there were. Raises InputError for another graph, and if something was recorded already.
+        Per history and per operator the average over the earlier instances of success and of seconds per try, not of Q:
+        the price of time may be another one here. Weight: `n_equiv` visits, in batches of the mean size there, but no
+        more visits than there were. Raises InputError for another graph, and if something was recorded already.
         """
         if self._total.visits:
             raise InputError("warm start comes before the first record; this chooser has records already")
         if not n_equiv > 0:
             raise InputError(f"n_equiv is {n_equiv} batches; expected more than 0")
-        by_problem: dict[Problem, list[Statistics]] = {}
-        by_path: dict[str, list[Statistics]] = {}
+        of_operator: dict[Problem, list[Statistics]] = {}
+        of_history: dict[_History, list[Statistics]] = {}
         totals = []
         for data in earlier:
             for problem, entry in _operators_in(self.transitions, data).items():
-                by_problem.setdefault(problem, []).append(_read_statistics(entry))
+                of_operator.setdefault(problem, []).append(_read_statistics(entry))
             for entry in data["sequences"]:
-                by_path.setdefault(entry["sequence"], []).append(_read_statistics(entry))
-            totals.append(Statistics(**data["totals"]))
-        for problem, statistics in by_problem.items():
-            self._operators.setdefault(problem, _Operator(problem)).statistics = _averaged(statistics, n_equiv)
-        for text, statistics in by_path.items():
-            self._node(_read_prefix(self.transitions, text)).statistics = _averaged(statistics, n_equiv)
+                of_history.setdefault(self._history_at(entry["sequence"]), []).append(_read_statistics(entry))
+            totals.append(Totals(**data["totals"]))
+        for problem, statistics in of_operator.items():
+            self._operator(problem).statistics = _averaged(statistics, n_equiv)
+        for history, statistics in of_history.items():
+            history.statistics = _averaged(statistics, n_equiv)
         totals = [total for total in totals if total.visits and total.seconds]
         if totals:
             # Samples per second are averaged as they are; the weight is n_equiv visits of the mean length.
-            scale = [n_equiv / total.visits for total in totals]
-            seconds = sum(s * t.seconds for s, t in zip(scale, totals)) / len(totals)
-            rate = sum(t.successes / t.seconds for t in totals) / len(totals)
-            roots = sum(t.conditions / t.seconds for t in totals) / len(totals)
-            self._total = Statistics(conditions=roots * seconds, successes=rate * seconds, seconds=seconds)
+            seconds = sum(n_equiv / total.visits * total.seconds for total in totals) / len(totals)
+            rate = sum(total.samples / total.seconds for total in totals) / len(totals)
+            roots = sum(total.rollouts / total.seconds for total in totals) / len(totals)
+            self._total = Totals(rollouts=roots * seconds, samples=rate * seconds, seconds=seconds)
+        self._predict_operators()
 
 
 class Tree(_Records):
@@ -443,10 +652,10 @@ class Tree(_Records):
 
     c_uct: weight of the exploration bonus, on values normalised to [0, 1] among siblings. reward: "rate" (time costs
     the discounted realised rate) or "rollout" (time costs one over the mean seconds per rollout).
-    equivalent_visits: an operator's visits elsewhere count on an edge like up to so many visits of its own, so that
-    not every child of every node is tried anew. retain: on failure the components which the failed transition does not
-    touch are kept and combined again; without it the whole partial sample is dropped. discount: factor on old evidence
-    per visit. initial_cost: guessed seconds per condition of an operator that never ran.
+    equivalent_visits: an operator's visits after other histories count on an edge like up to so many visits of its own,
+    so that not every child of every node is tried anew. retain: on failure the components which the failed transition
+    does not touch are kept and combined again; without it the whole partial sample is dropped. discount: factor on old
+    evidence per visit. initial_cost: guessed seconds per try of an operator that never ran.
 
     Every kept transition is tried again and again: its bonus grows with the logarithm of its siblings' visits, while
     what its operator does elsewhere counts at most `equivalent_visits`.
@@ -457,12 +666,12 @@ class Tree(_Records):
     def __init__(
         self,
         transitions: Transitions,
-        c_uct: float = 0.03,
+        c_uct: float = 0.04,
         reward: Literal["rate", "rollout"] = "rate",
         retain: bool = True,
         equivalent_visits: float = 4.0,
         discount: float = 0.998,
-        initial_cost: float = 1e-4,
+        initial_cost: float = 2.5e-5,
     ) -> None:
         super().__init__(transitions, retain, discount, initial_cost)
         if reward not in ("rate", "rollout"):
@@ -475,9 +684,9 @@ class Tree(_Records):
         self.c_uct = c_uct
         self.reward = reward
         self.equivalent_visits = equivalent_visits
-        self._below: dict[State, float | None] = {}  # values by state, from operators alone
+        self._below: dict[State, tuple[float, float] | None] = {}  # value and reach by state, from operators alone
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
-        self._nodes_evaluated = 0
+        self._edges_evaluated = 0
         self._records_since_refresh = 0
         self._stale = True
 
@@ -504,47 +713,56 @@ class Tree(_Records):
         if self._stale:
             self._refresh()
         price = self.price
-        node: _Node = self._root
-        state: State = frozenset()
-        while state != self.transitions.full:
-            children = self._expand(node, state)
-            if not node.interior:
-                self._guess(node, children, price)
+        node, path = self._root, []
+        while node.state != self.transitions.full:
+            edges = self._expand(node)
+            if not node.visited:
+                for edge in edges:
+                    self._evaluate_edge(edge, price)
             if self._any_unready:
-                children = [child for child in children if self._may_go(child.step)]
+                edges = [edge for edge in edges if self._may_go(edge.step)]
             chosen = None
-            while children and chosen is None:
-                chosen = self._most_promising(children)
+            while edges and chosen is None:
+                chosen = self._most_promising(edges)
                 # On a large graph only the chosen one is asked whether it leads to the end.
                 if self._any_unready and not self._state_can_finish(chosen.step.target):
-                    children.remove(chosen)
+                    edges.remove(chosen)
                     chosen = None
             if chosen is None:
                 return ()
-            node, state = chosen, chosen.step.target
-        return node.path
+            path.append(chosen.step.transition)
+            node = self._behind(chosen)
+        return tuple(path)
 
-    def _most_promising(self, children: list[_Node]) -> _Node:
-        """Paper, Eq. 3, with Q normalised among siblings; ties go to the first."""
-        counts, least, greatest = [], math.inf, -math.inf
-        for child in children:
-            pooled = child.step.operator.statistics.visits
-            own = child.statistics.visits
+    @property
+    def _curious(self) -> bool:
+        return self._states is not None and self._total.first_trials <= CURIOSITY * self._total.seconds
+
+    def _most_promising(self, edges: list[_Edge]) -> _Edge:
+        """Paper, Eq. 3, with Q normalised among siblings; ties go to the first.
+
+        From the best one's Q down by its probability to finish, that is, by all that could be gained: between the
+        least and the greatest, one hopeless sibling would make all others look alike.
+        """
+        counts = []
+        for edge in edges:
+            pooled = edge.step.operator.statistics.visits
+            own = edge.history.statistics.visits
             count = own + min(max(pooled - own, 0.0), self.equivalent_visits)
             if count <= 0.0:
-                if self._states is not None:
-                    return child  # never tried anywhere: infinite bonus, smallest first
+                if self._curious:
+                    return edge  # never tried anywhere: infinite bonus, smallest first
                 count = UNTRIED_VISITS
             counts.append(count)
-            least, greatest = min(least, child.quality), max(greatest, child.quality)
-        scale = 1.0 / (greatest - least) if greatest > least else 0.0
+        greatest = max(edges, key=lambda edge: edge.quality)
         # Fractions of a batch would make the logarithm negative, hence 1 +.
         log_n = math.log(1.0 + sum(counts))
-        best, best_score = children[0], -math.inf
-        for child, count in zip(children, counts):
-            score = (child.quality - least) * scale + self.c_uct * _bonus(log_n / count)
+        best, best_score = edges[0], -math.inf
+        for edge, count in zip(edges, counts):
+            deficit = (greatest.quality - edge.quality) / max(greatest.reach, 1e-12)
+            score = self.c_uct * _bonus(log_n / count) - min(deficit, 1.0)
             if score > best_score:
-                best, best_score = child, score
+                best, best_score = edge, score
         return best
 
     # Readiness
@@ -576,7 +794,7 @@ class Tree(_Records):
     def _representatives(self) -> list[tuple[_Operator, Transition]]:
         """Every operator of a small graph with one of its transitions."""
         first: dict[int, tuple[_Operator, Transition]] = {}
-        for step in self._by_made:
+        for step, _ in self._by_made:
             first.setdefault(id(step.operator), (step.operator, step.transition))
         return list(first.values())
 
@@ -602,91 +820,69 @@ class Tree(_Records):
 
     # Values
 
-    def _recorded(self, node: _Node) -> None:
+    def _recorded(self, lineage: list[_Edge]) -> None:
         """Back up along the sequence at once; everything else follows at the next refresh."""
         self._records_since_refresh += 1
-        operator = node.step.operator
-        first_time = operator.statistics.visits <= node.statistics.visits <= 1.0
+        made = lineage[-1].history
+        first_time = made.operator.statistics.visits <= made.statistics.visits <= 1.0
         # A refresh visits every edge of the tree: its cost is spread over a proportional number of records.
-        if first_time or self._records_since_refresh > max(12, self._nodes_evaluated // 16):
+        if first_time or self._records_since_refresh > max(12, self._edges_evaluated // 16):
             self._stale = True
         if self._stale:
             return
-        operator.predict(self.initial_cost)
+        made.operator.predict(self._trust)
+        made.predict(self._trust)
         price = self.price
-        child, lineage = node, []
-        while child.parent is not None:
-            lineage.append(child)
-            child = child.parent
-        for child in reversed(lineage):
-            self._produce(child.parent, child)
-        for child in lineage:
-            child.quality = self._quality(child.parent, child, child.value, price)
-            parent = child.parent
-            if not parent.expanded:
-                self._stale = True
-                return
-            parent.value = max(self._allowed(parent.children.values()), default=parent.value)
+        for edge, node in zip(reversed(lineage), reversed([self._root, *map(self._behind, lineage[:-1])])):
+            self._evaluate_edge(edge, price)
+            self._back_up(node)
 
-    def _allowed(self, children: Iterable[_Node]) -> list[float]:
-        """Qualities of the children that may be chosen; nothing is worth waiting for what is not ready."""
-        if not self._any_unready:
-            return [child.quality for child in children]
-        return [child.quality for child in children if self._may_go(child.step)]
-
-    def _produce(self, parent: _Node, child: _Node) -> None:
-        success, cost = self._blend(child.step.operator, child)
-        child.costs = _advance(parent.costs, child.step, success, cost)
-
-    def _quality(self, parent: _Node, child: _Node, value: float, price: float) -> float:
-        success, cost = self._blend(child.step.operator, child)
-        for component in child.step.kept:
-            cost -= (1.0 - success) * parent.costs[component]
-        return success * value - price * cost
-
-    def _expand(self, node: _Node, state: State) -> list[_Node]:
-        """All children of a node in the order of the transitions."""
-        if not node.expanded:
-            steps = self._steps_from(state)
-            known = node.children
-            node.children = {new: known.get(new) or _Node(node, step) for new, step in steps.items()}
-            node.expanded = True
-        return list(node.children.values())
-
-    def _guess(self, node: _Node, children: list[_Node], price: float) -> None:
-        """Qualities of children on which nothing was recorded; a refresh leaves them out."""
-        if node.parent is not None:
-            self._produce(node.parent, node)
-        for child in children:
-            child.value = self._value_below(child.step.target)
-            child.quality = self._quality(node, child, child.value, price)
+    def _back_up(self, node: _Node) -> None:
+        """Value of a node: that of its best edge; nothing is worth waiting for what is not ready."""
+        edges: Iterable[_Edge] = node.edges.values()
+        if self._any_unready:
+            edges = [edge for edge in edges if self._may_go(edge.step)]
+        best = max(edges, key=lambda edge: edge.quality, default=None)
+        node.value, node.reach = (best.quality, best.reach) if best else (0.0, 0.0)
 
     def _refresh(self) -> None:
         """Recompute all predictions: operators, values by state, and the tree."""
-        for operator in self._operators.values():
-            operator.predict(self.initial_cost)
-        self._below = {self.transitions.full: 1.0}
+        self._predict_operators()
+        self._below = {self.transitions.full: (1.0, 1.0)}
         if self._states is not None:
             self._solve_states(self.price)
         else:
             self._per_variable = self._share_among_variables()
-        self._nodes_evaluated = 0
+        self._edges_evaluated = 0
         self._evaluate(self._root, self.price)
         self._records_since_refresh = 0
         self._stale = False
 
     def _evaluate(self, node: _Node, price: float) -> None:
-        """Values of the recorded part of the tree, by what was recorded; of its leaves, by their states."""
-        children = self._expand(node, node.step.target if node.step else frozenset())
-        for child in children:
-            if child.interior:
-                self._produce(node, child)
-                self._evaluate(child, price)
-            else:
-                child.value = self._value_below(child.step.target)
-            child.quality = self._quality(node, child, child.value, price)
-        self._nodes_evaluated += len(children)
-        node.value = max(self._allowed(children), default=0.0)
+        """Values of the visited part of the tree, by its histories; of its leaves, by their states."""
+        node.version = self._version
+        edges = self._expand(node)
+        for edge in edges:
+            self._evaluate_edge(edge, price)
+        self._edges_evaluated += len(edges)
+        self._back_up(node)
+
+    def _evaluate_edge(self, edge: _Edge, price: float) -> None:
+        if edge.node is None:
+            edge.node = self._nodes.get(frozenset((*edge.kept, edge.history)))
+        node = edge.node
+        if node is not None and node.visited and node.state != self.transitions.full:
+            if node.version != self._version:
+                self._evaluate(node, price)
+            edge.value, reach = node.value, node.reach
+        else:
+            edge.value, reach = self._value_below(edge.step.target)
+        history = self._predicted(edge.history)
+        success, cost = history.hopeful_success, history.hopeful_cost
+        for component in edge.kept:
+            cost -= (1.0 - success) * self._predicted(component).item_cost
+        edge.quality = success * edge.value - price * cost
+        edge.reach = success * reach
 
     def _solve_states(self, price: float) -> None:
         """Dynamic programming over states with the operators' statistics, for what lies below the tree.
@@ -694,7 +890,7 @@ class Tree(_Records):
         First the least cost per item of every component that can be made, then the values backwards.
         """
         costs: dict[State, float] = {}
-        for step in self._by_made:
+        for step, _ in self._by_made:
             operator = step.operator
             if operator.ready:
                 cost = operator.cost
@@ -706,53 +902,59 @@ class Tree(_Records):
         below = self._below
         for state, steps in self._backwards:
             best = None
-            for step in steps:
+            for step, kept in steps:
                 operator, beyond = step.operator, below[step.target]
                 if beyond is None or not operator.ready:
                     continue
-                success, cost = operator.success, operator.cost
-                for component in step.kept:
+                success, cost = operator.hopeful_success, operator.hopeful_cost
+                for component in kept:
                     cost -= (1.0 - success) * costs.get(component, 0.0)
-                quality = success * beyond - price * cost
-                if best is None or quality > best:
-                    best = quality
+                quality = success * beyond[0] - price * cost
+                if best is None or quality > best[0]:
+                    best = quality, success * beyond[1]
             below[state] = best
 
+    def _with_kept(self, state: State) -> list[tuple[_Step, tuple[State, ...]]]:
+        """The steps out of a state with the components that their failure leaves."""
+        components = self.transitions.graph.components(state) if self.retain else ()
+        steps = self._steps_from(state).values()
+        return [(step, tuple(c for c in components if c not in step.used)) for step in steps]
+
     @cached_property
-    def _by_made(self) -> list[_Step]:
+    def _by_made(self) -> list[tuple[_Step, tuple[State, ...]]]:
         """All steps of a small graph, those that make small components first."""
-        steps = [step for state in self._states for step in self._steps_from(state).values()]
-        return sorted(steps, key=lambda step: len(step.made))
+        steps = [pair for _, pairs in self._backwards for pair in pairs]
+        return sorted(reversed(steps), key=lambda pair: len(pair[0].made))
 
     @cached_property
-    def _backwards(self) -> list[tuple[State, list[_Step]]]:
+    def _backwards(self) -> list[tuple[State, list[tuple[_Step, tuple[State, ...]]]]]:
         """The states of a small graph with their steps, from just before the full set to the empty one."""
-        return [(state, list(self._steps_from(state).values())) for state in reversed(self._states[:-1])]
+        return [(state, self._with_kept(state)) for state in reversed(self._states[:-1])]
 
-    def _value_below(self, state: State) -> float:
-        """Value of a state by the operators' statistics alone: the best one on a small graph.
+    def _value_below(self, state: State) -> tuple[float, float]:
+        """Value and reach of a state by the operators' statistics alone: the best ones on a small graph.
 
         On a large graph an optimistic guess that needs no enumeration: every variable is assigned at the success per
         variable of the best operator that ever assigned it. The plain bound of one would send the search through all
         children of all nodes before it compared any two.
         """
-        value = self._below.get(state)
-        if value is None:
-            value = 0.0
+        known = self._below.get(state)
+        if known is None:
+            known = 0.0, 0.0
             if self._states is None:
                 success, cost = 1.0, 0.0
                 for name in self.transitions.full.difference(state):
                     share = self._per_variable.get(name)
                     if share is not None:
                         success, cost = success * share[0], cost + share[1]
-                value = self._below[state] = success - self.price * cost
-        return value
+                known = self._below[state] = success - self.price * cost, success
+        return known
 
     def _share_among_variables(self) -> dict[str, tuple[float, float]]:
         """Greatest success per variable, and that operator's seconds per variable, of the variables ever assigned."""
         shares: dict[str, tuple[float, float]] = {}
         for (new, _), operator in self._operators.items():
-            if operator.statistics.conditions and operator.ready:
+            if operator.statistics.attempts and operator.ready:
                 success, cost = operator.success ** (1.0 / len(new)), operator.cost / len(new)
                 for name in new:
                     if name not in shares or shares[name][0] < success:
@@ -769,8 +971,12 @@ class Tree(_Records):
         self._refresh()
         return super().as_json()
 
-    def _value_of(self, node: _Node) -> dict[str, float]:
-        return {"q": self._quality(node.parent, node, node.value, self.price)}
+    def _value_of(self, history: _History) -> dict[str, float]:
+        return {"q": self._follow(history.prefix)[-1].quality}
+
+    def add(self, data: dict[str, Any]) -> None:
+        super().add(data)
+        self._stale = True
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
@@ -783,7 +989,7 @@ class Tree(_Records):
         settings = data["settings"]
         fields = ("c_uct", "reward", "retain", "equivalent_visits", "discount", "initial_cost")
         tree = cls(transitions, **{name: settings[name] for name in fields if name in settings})
-        tree._load(data)
+        tree.add(data)
         return tree
 
 
@@ -795,7 +1001,7 @@ class Fixed(_Records):
     def __init__(self, transitions: Transitions, path: Sequence[Transition], **settings: Any) -> None:
         super().__init__(transitions, **settings)
         self.path = tuple(path)
-        self._node(self.path)
+        self._follow(self.path)
         if not self.path or self.path[-1].target != transitions.full:
             raise InputError(f"sequence {transitions.format(self.path)!r} does not assign all variables")
 
@@ -847,14 +1053,25 @@ def _bonus(x: float) -> float:
     return max(math.sqrt(x), 0.25 * x * x)
 
 
-def _advance(costs: dict[State, float], step: _Step, success: float, cost: float) -> dict[State, float]:
-    """Production cost per item of every component after a step, in device seconds."""
-    after = {component: costs[component] for component in step.kept}
-    after[step.made] = (sum(costs[component] for component in step.used) + cost) / max(success, 1e-12)
-    return after
+def _hopeful(hazards: Sequence[float], tries: float) -> tuple[float, float]:
+    """As `_within`, for hazards above their means by HOPE standard deviations of a beta distribution of that weight."""
+    return _within([min(h + HOPE * math.sqrt(h * (1.0 - h) / (tries + 1.0)), 1.0) for h in hazards])
 
 
-def _described(statistics: Statistics) -> dict[str, float | None]:
+def _within(hazards: Sequence[float]) -> tuple[float, float]:
+    """Success within all tries, and the mean number of tries, when try k succeeds with probability hazards[k]."""
+    failed, tries = 1.0, 0.0
+    for hazard in hazards:
+        tries += failed
+        failed *= 1.0 - hazard
+    return 1.0 - failed, tries
+
+
+def _add(to: Statistics, other: Statistics) -> None:
+    to.add(other.visits, other.attempts, other.successes, other.seconds)
+
+
+def _described(statistics: Statistics) -> dict[str, Any]:
     return {
         **asdict(statistics),
         "success_rate": statistics.success_rate,
@@ -863,7 +1080,8 @@ def _described(statistics: Statistics) -> dict[str, float | None]:
 
 
 def _read_statistics(entry: dict[str, Any]) -> Statistics:
-    return Statistics(**{name: float(entry[name]) for name in Statistics.__dataclass_fields__})
+    attempts, successes = (list(map(float, entry[name])) for name in ("attempts", "successes"))
+    return Statistics(float(entry["visits"]), attempts, successes, float(entry["seconds"]))
 
 
 def _read_prefix(transitions: Transitions, text: str) -> Path:
@@ -895,14 +1113,18 @@ def _operators_in(transitions: Transitions, data: dict[str, Any]) -> dict[Proble
 
 
 def _averaged(earlier: list[Statistics], n_equiv: float) -> Statistics:
-    """Mean success and mean seconds per condition over instances, with the weight of n_equiv batches."""
-    earlier = [statistics for statistics in earlier if statistics.conditions]
+    """Mean success of each try and mean seconds per try over instances, with the weight of n_equiv batches."""
+    earlier = [statistics for statistics in earlier if statistics.tries]
     if not earlier:
         return Statistics()
     visits = min(n_equiv, sum(statistics.visits for statistics in earlier))
-    per_visit = sum(s.conditions / max(s.visits, 1e-9) for s in earlier) / len(earlier)
-    conditions = visits * per_visit
-    tries = sum(s.attempts / s.conditions for s in earlier) / len(earlier)
-    success = sum(s.success_rate for s in earlier) / len(earlier)
-    seconds = sum(s.seconds_per_condition for s in earlier) / len(earlier)
-    return Statistics(visits, conditions, conditions * success, conditions * tries, conditions * seconds)
+    per_visit = sum(s.tries / max(s.visits, 1e-9) for s in earlier) / len(earlier)
+    seconds = sum(s.seconds_per_try for s in earlier) / len(earlier)
+    attempts, successes = [], []
+    for k in range(max(len(s.attempts) for s in earlier)):
+        reached = [s for s in earlier if k < len(s.attempts) and s.attempts[k]]
+        share = sum(s.attempts[k] / s.tries for s in reached) / len(earlier)
+        hazard = sum(s.successes[k] / s.attempts[k] for s in reached) / len(reached) if reached else 0.0
+        attempts.append(visits * per_visit * share)
+        successes.append(attempts[-1] * hazard)
+    return Statistics(visits, attempts, successes, sum(attempts) * seconds)

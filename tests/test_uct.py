@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from paper_graphs import banana, handover, pick_place, regrasps
 
+from cgs_jax import uct
 from cgs_jax.errors import InputError
 from cgs_jax.graph import Constraint, ConstraintGraph, Variable
 from cgs_jax.transitions import Transitions
-from cgs_jax.uct import Fixed, Random, Tree
+from cgs_jax.uct import Fixed, Random, Statistics, Tree
 
 
 def pair_graph() -> Transitions:
@@ -80,17 +81,23 @@ def test_golden_tree_by_hand():
     transitions = pair_graph()
     a_first = transitions.parse("a; b")
     tree = Tree(transitions, c_uct=1.0, retain=False, equivalent_visits=2.0, discount=1.0)
-    tree.record((), a_first[0], conditions=100, successes=50, seconds=1.0)
-    tree.record(a_first[:1], a_first[1], conditions=50, successes=10, seconds=0.5)
+    tree.record((), a_first[0], attempts=100, successes=50, seconds=1.0)
+    tree.record(a_first[:1], a_first[1], attempts=50, successes=10, seconds=0.5)
     assert tree.rate == pytest.approx(10 / 1.5)
-    # Operators: prior 0.7 per variable with the weight of two conditions; edges: as many conditions of their
-    # operator's mean as it has seen.
-    p_a = 0.5 * (0.5 + (50 + 1.4) / 102)
-    p_b = 0.5 * (0.2 + (10 + 1.4) / 52)
-    value_a = p_b - 10 / 1.5 * 0.01
+    # Operators: prior 0.7 per variable with the weight of two tries; histories: their operator's mean by the
+    # guessed correlation, since no operator has two of them.
+    weight = 1 / uct.CORRELATION - 1
+    p_a = (50 + weight * (50 + 1.4) / 102) / (100 + weight)
+    p_b = (10 + weight * (10 + 1.4) / 52) / (50 + weight)
+
+    def hopeful(p, tries):
+        """The mean and a share of the standard deviation of the beta distribution that is known so far."""
+        return p + uct.HOPE * math.sqrt(p * (1 - p) / (tries + weight + 1))
+
+    value_a = hopeful(p_b, 50) - 10 / 1.5 * 0.01
     entries = {entry["sequence"]: entry for entry in tree.as_json()["sequences"]}
     assert entries["a; b"]["q"] == pytest.approx(value_a)
-    assert entries["a"]["q"] == pytest.approx(p_a * value_a - 10 / 1.5 * 0.01)
+    assert entries["a"]["q"] == pytest.approx(hopeful(p_a, 100) * value_a - 10 / 1.5 * 0.01)
     assert tree.predict_rate(a_first) == pytest.approx(p_a * p_b / (0.01 + p_a * 0.01))
     # b and (a,b) were never tried: smallest first, then the joint one.
     assert transitions.format(tree.select()).startswith("b")
@@ -129,8 +136,8 @@ def test_what_is_kept_lowers_the_price_of_failure():
         third = 0.1 - price * 3
         returned = 2.0 if retain else 0.0  # an a costs 1 s / 0.5
         second = 0.25 * third + price * (0.75 * returned - 2)
-        assert quality[retain]["a; b"] == pytest.approx(second, rel=1e-4)
-        assert quality[retain]["a"] == pytest.approx(0.5 * second - price, rel=1e-4)
+        assert quality[retain]["a; b"] == pytest.approx(second, rel=1e-3)
+        assert quality[retain]["a"] == pytest.approx(0.5 * second - price, rel=1e-3)
 
 
 ROLLOUTS = 600
@@ -253,7 +260,7 @@ def test_unknown_sequences_and_impossible_records_are_refused():
     path = transitions.parse("a; b")
     with pytest.raises(InputError, match="does not follow"):
         tree.record((), path[1], 1, 1, 0.0)
-    with pytest.raises(InputError, match="0 <= successes <= conditions"):
+    with pytest.raises(InputError, match="0 <= successes <= attempts"):
         tree.record((), path[0], 1, 2, 0.0)
     with pytest.raises(InputError, match="leaves b unassigned"):
         tree.predict_rate(path[:1])
@@ -288,7 +295,7 @@ def test_tree_of_another_graph_is_refused_in_one_line():
         with pytest.raises(InputError, match="for graph 'pick_place' .*expected 'handover'") as caught:
             load(Transitions(handover()))
         assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="schema 'other'; expected 'cgs_jax.tree/1'"):
+    with pytest.raises(InputError, match="schema 'other'; expected 'cgs_jax.tree/2'"):
         Tree.from_json(Transitions(pick_place()), {**data, "schema": "other"})
 
 
@@ -306,7 +313,7 @@ def test_warm_start_averages_success_and_time():
     warm.warm_start(earlier, n_equiv=3)
     statistics = warm.operator_statistics()[path[0].problem]
     assert statistics.visits == 3
-    assert statistics.conditions == pytest.approx(300)
+    assert statistics.attempts == pytest.approx([300])
     assert statistics.success_rate == pytest.approx(0.5)
     assert statistics.seconds_per_condition == pytest.approx(0.02)
     assert warm.rate == pytest.approx((20 / 2 + 80 / 4) / 2)
@@ -384,3 +391,116 @@ def test_thirty_variables():
     assert tree.select(lambda t: False) == ()
     assert tree.select()[-1].target == transitions.full
     assert all(math.isfinite(entry["q"]) for entry in tree.as_json()["sequences"])
+
+
+def test_orders_of_independent_steps_share_what_they_learn():
+    transitions = Transitions(handover())
+    tree = Tree(transitions, discount=1.0)
+    one = transitions.parse("t_a; t_b; q_a1; (q_a2,p); q_b2; q_b1")
+    other = transitions.parse("t_b; t_a; (q_a2,p); q_a1; q_b2; q_b1")
+    for i, step in enumerate(one):
+        tree.record(one[:i], step, 1000, 300 + 50 * i, 0.1)
+    # The grasps, and q_a1 and (q_a2,p) after t_a alone, came about in the same way; q_a1 after q_a2 did not.
+    assert tree.predict_rate(transitions.parse("t_b; t_a; q_a1; (q_a2,p); q_b2; q_b1")) == pytest.approx(tree.predict_rate(one))
+    assert tree.predict_rate(other) != pytest.approx(tree.predict_rate(one))
+    before = {e["sequence"]: e["visits"] for e in tree.as_json()["sequences"]}
+    tree.record(other[:1], other[1], 1000, 300, 0.1)
+    after = {e["sequence"]: e["visits"] for e in tree.as_json()["sequences"]}
+    assert after == before | {"t_a": 2.0}
+
+
+def test_conditions_that_wait_for_another_try_are_no_failures():
+    """Success within four tries, seen when most conditions have had only one or two: 1 - 0.8 * 0.9 * 0.9 * 0.95."""
+    statistics = Statistics()
+    statistics.add(1.0, [1000, 500, 20, 20], [200, 50, 2, 1], 3.08)
+    assert statistics.success_rate == pytest.approx(1 - 0.8 * 0.9 * 0.9 * 0.95)
+    tries = 1 + 0.8 + 0.8 * 0.9 + 0.8 * 0.9 * 0.9
+    assert statistics.seconds_per_condition == pytest.approx(tries * 3.08 / 1540)
+    # Tries that were never made are believed to succeed like the one before.
+    again = Statistics()
+    again.add(1.0, [1000, 0], [200, 0], 1.0)
+    assert again.hazards([0.5], 0.0) == pytest.approx([0.2, 0.2])
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.15])
+def test_weight_of_pooled_statistics_is_learned(spread):
+    """Success of an operator after 200 histories: a mean with and without a known spread about it."""
+    transitions = Transitions(regrasps(3))
+    tree = Fixed(transitions, next(transitions.sequences()), discount=1.0)
+    generator = np.random.default_rng(0)
+    seen = set()
+    for path, _ in zip(transitions.sequences(), range(4000)):
+        for i, step in enumerate(path):
+            history = tree._follow(path[: i + 1])[-1].history
+            if history not in seen and len(seen) < 400:
+                seen.add(history)
+                success = 0.5 + spread * generator.choice([-1, 1])
+                tree.record(path[:i], step, 2000, int(generator.binomial(2000, success)), 0.1)
+    # Two points at +-d about 1/2: the share of the variance between histories is d^2 / (1/4).
+    expected = spread**2 / 0.25
+    assert tree._correlation() == pytest.approx(expected, abs=0.02)
+
+
+class HistoryWorld:
+    """Success belongs to histories: about the operator's, with the scatter seen on real scenes. Pools as the sampler has."""
+
+    def __init__(self, transitions, seed, scatter=0.35):
+        self.world = World(transitions, seed)
+        self.scatter, self.generator, self.known, self.pools = scatter, np.random.default_rng(200 + seed), {}, {}
+
+    def histories(self, path):
+        """Per step what it reads and what it makes."""
+        came_about, result = {}, []
+        for step in path:
+            reads = [came_about.pop(c) for c in list(came_about) if c & step.condition]
+            made = (step.problem, frozenset(reads))
+            came_about[frozenset(step.new).union(*(self.members(read) for read in reads))] = made
+            result.append((reads, made))
+        return result
+
+    def members(self, history):
+        return frozenset(history[0][0]).union(*map(self.members, history[1]))
+
+    def success(self, history):
+        if history not in self.known:
+            noise = self.generator.normal(0, self.scatter) if history[1] else 0.0
+            self.known[history] = float(np.clip(self.world.success[history[0]] * np.exp(noise), 0.01, 0.95))
+        return self.known[history]
+
+    def seconds_per_sample(self, path):
+        costs = {}
+        for step, (reads, made) in zip(path, self.histories(path)):
+            costs[made] = (sum(costs.pop(read) for read in reads) + self.world.cost[step.problem]) / self.success(made)
+        return sum(costs.values())
+
+    def run(self, tree, batch=256):
+        """One batch: of the chosen sequence's last step or, where that lacks inputs, of what makes the scarcest."""
+        path = tree.select()
+        ways = self.histories(path)
+        makers = {made: i for i, (_, made) in enumerate(ways)}
+        i = len(path) - 1
+        while True:
+            reads, made = ways[i]
+            scarcest = min(reads, key=lambda read: self.pools.get(read, 0), default=None)
+            if scarcest is None or self.pools.get(scarcest, 0) >= batch // 4:
+                break
+            i = makers[scarcest]
+        count = min([batch, *(self.pools[read] for read in reads)])
+        for read in reads:
+            self.pools[read] -= count
+        passed = int(self.generator.binomial(count, self.success(made)))
+        tree.record(path[:i], path[i], count, passed, count * self.world.cost[path[i].problem])
+        self.pools[made] = self.pools.get(made, 0) + passed
+        return path
+
+
+def test_choice_converges_where_histories_matter():
+    """2,000 batches, about as many as a run of 20 s has. Over these worlds 0.72 to 0.94 of the best of 960 sequences' rate."""
+    transitions, reached = Transitions(handover()), []
+    for seed in range(5):
+        world, tree = HistoryWorld(transitions, seed), Tree(transitions)
+        for _ in range(2000):
+            world.run(tree)
+        least = min(map(world.seconds_per_sample, transitions.sequences()))
+        reached.append(least * tree.rate)
+    assert min(reached) > 0.6 and np.mean(reached) > 0.8

@@ -222,31 +222,11 @@ def priced_tree(transitions: Transitions, factor: float, **options: Any) -> Choo
 
 
 def merged_tree(transitions: Transitions, trees: Sequence[Mapping[str, Any]]) -> Tree:
-    """A tree that knows the operators' pooled statistics of several runs on one instance, and no sequence's own."""
-    operators: dict[tuple, dict[str, Any]] = {}
-    counted = ("visits", "conditions", "successes", "attempts", "seconds")
-    totals = dict.fromkeys(counted, 0.0)
+    """A tree that knows the statistics of several runs on one instance."""
+    merged = Tree(transitions)
     for tree in trees:
-        for entry in tree["operators"]:
-            key = (tuple(entry["new"]), tuple(entry["constraints"]))
-            mine = operators.setdefault(key, {"new": entry["new"], "constraints": entry["constraints"]})
-            for name in counted:
-                mine[name] = mine.get(name, 0.0) + entry[name]
-        for name in counted:
-            totals[name] += tree["totals"][name]
-    first = trees[0]
-    return Tree.from_json(
-        transitions,
-        {
-            "schema": first["schema"],
-            "graph": first["graph"],
-            "fingerprint": first["fingerprint"],
-            "settings": {},
-            "totals": totals,
-            "operators": list(operators.values()),
-            "sequences": [],
-        },
-    )
+        merged.add(tree)
+    return merged
 
 
 def signature(path: Path) -> frozenset:
