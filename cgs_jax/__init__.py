@@ -29,7 +29,9 @@ _HOMES = {
     "rollout": "api",
     "sample": "api",
     "stream": "api",
-    "with_constraint": "problems",
+    "with_constraint": "own",
+    "with_sampler": "own",
+    "with_variable": "own",
 }
 
 __all__ = sorted(_HOMES)

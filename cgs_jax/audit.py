@@ -16,7 +16,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -44,13 +44,15 @@ _CLEARANCE = 1e-5
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Largest violations that pass: m, rad, m of penetration, rad or m beyond a limit, excess length of quaternions."""
+    """Largest violations that pass: m, rad, m of penetration, rad or m beyond a limit, excess length of quaternions, rows of
+    a user's own constraints in their own unit."""
 
     position: float = 1e-4
     rotation: float = 1e-4
     penetration: float = 1e-4
     limit: float = 1e-6
     quaternion: float = 1e-6
+    own: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,24 @@ class AuditResult:
     tolerance: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class OwnCheck:
+    """A condition that a user brought along; its column is called `OWN + name`.
+
+    kind: "rows" (held to `Tolerances.own`) or "limit" (`Tolerances.limit`). scope: the variables that it reads.
+    violation: function of values (N, dim) by variable, float64, to (N,).
+    """
+
+    name: str
+    kind: Literal["rows", "limit"]
+    scope: tuple[str, ...]
+    violation: Callable[[Mapping[str, Floats]], Floats]
+
+
+OWN = "own: "
+"""What names of columns begin with that only the maker of the samples can check."""
+
+
 class Auditor:
     """Checks samples of one scene. Threads may share it: what a call writes to is its own.
 
@@ -76,6 +96,7 @@ class Auditor:
     attachments, placements, goals: the lists of the schema `cgs_jax/1`. An attachment or a placement may also name its
         `"variable"`: a stored value of that name is then compared with `qpos`.
     mode_switches: names in time order; a sample has one configuration for each.
+    own: what a user's constraints and variables demand of the values.
 
     Raises InputError for a name that the model or `mode_switches` does not have.
     """
@@ -88,8 +109,10 @@ class Auditor:
         goals: Sequence[Mapping[str, Any]],
         mode_switches: Sequence[str],
         tolerances: Tolerances | None = None,
+        own: Sequence[OwnCheck] = (),
     ) -> None:
         self.mode_switches = tuple(mode_switches)
+        self._own = tuple(own)
         self.tolerances = tolerances or Tolerances()
         self._nq = int(model.nq)
         self._kinematics = _Kinematics(model)
@@ -108,6 +131,7 @@ class Auditor:
         columns = [column for condition in self._conditions for column in condition.columns]
         columns += [(f"penetration at {switch} (m)", t.penetration) for switch in self.mode_switches]
         columns += [("joint limits (rad or m)", t.limit), ("unit quaternions", t.quaternion)]
+        columns += [(OWN + check.name, t.own if check.kind == "rows" else t.limit) for check in self._own]
         self.constraints: tuple[str, ...] = tuple(name for name, _ in columns)
         self.tolerance = np.array([bound for _, bound in columns])
 
@@ -116,9 +140,10 @@ class Auditor:
 
         qpos: (N, K, nq) full configurations at the K mode switches.
         values: variables (N, dim) by name. Poses `[x y z qw qx qy qz]` that an attachment or placement names as its
-            `"variable"` must agree with `qpos`; the others need only be finite.
+            `"variable"` must agree with `qpos`; a user's own conditions read those in their scope; the others need only be
+            finite.
 
-        Raises InputError when `qpos` is not (N, K, nq) or a value does not have N rows.
+        Raises InputError when `qpos` is not (N, K, nq), a value does not have N rows, or one that `own` reads is missing.
         """
         qpos = np.asarray(qpos, dtype=np.float64)
         switches = len(self.mode_switches)
@@ -132,6 +157,9 @@ class Auditor:
             if stored[name].shape != (len(qpos), columns):
                 raise InputError(f"variable {name!r} has shape {stored[name].shape}, expected ({len(qpos)}, {columns})")
             finite &= np.isfinite(stored[name]).all(axis=1)
+        for name in (name for check in self._own for name in check.scope):
+            if name not in stored:
+                raise InputError(f"no values of {name!r}, which a condition reads; available: {', '.join(stored) or 'none'}")
         violation = np.full((len(qpos), len(self.constraints)), np.inf)
         rows = np.flatnonzero(finite)
         passes = -(-rows.size * switches // _CHUNK)
@@ -159,7 +187,7 @@ class Auditor:
         beyond, deviation = self._joints.errors(qpos)
         for name in self._poses & stored.keys():
             deviation = np.maximum(deviation, np.abs(np.linalg.norm(stored[name][:, 3:], axis=1) - 1.0))
-        columns += [beyond, deviation]
+        columns += [beyond, deviation, *(check.violation(stored) for check in self._own)]
         return np.stack(np.broadcast_arrays(*columns), axis=1)
 
     def _require_switch(self, name: str) -> None:

@@ -29,6 +29,7 @@ from cgs_jax.operators import (
     operator_of,
     propose_program,
 )
+from cgs_jax.own import own_checks
 from cgs_jax.problems import Problem
 from cgs_jax.scene import attachments, goals, placements
 from cgs_jax.transitions import Transition
@@ -101,7 +102,7 @@ class BatchRunner:
         task = problem.scene.task
         switches = [switch.name for switch in task.switches]
         self.auditor = Auditor(
-            problem.scene.model, attachments(task), placements(task), goals(task), switches, tolerances
+            problem.scene.model, attachments(task), placements(task), goals(task), switches, tolerances, own_checks(problem)
         )
         self._keyframes = Keyframes(problem)
         self._seed = seed
@@ -144,7 +145,8 @@ class BatchRunner:
         of_function = self._blank_configurations(operator.plan.given_configurations)
         arguments = (self._key_of(operator), np.uint32(0), scalar, given, of_function, self._numbers_of(operator))
         name = f"solve {layout.configurations} configurations, {layout.free} free poses"
-        key = None if layout.functions else f"propose {layout} {s.solver} {s.lanes}"
+        own = layout.functions or layout.samplers
+        key = None if own else f"propose {layout} {s.solver} {s.lanes}"
         futures = [programs.request(name, propose_program(layout, s.solver, s.lanes), arguments, key)]
         for clear in operator.clears:
             poses = np.zeros((batch, len(clear.poses), 7), np.float32)

@@ -1,4 +1,4 @@
-"""Constraints on products of poses, and a user's functions.
+"""Constraints on products of poses, and a user's functions and samplers.
 
 Kin, Grasp and Position are one thing: a product of poses (constants, pose variables, tools of chains at configurations) and
 six rows on its value, `low <= row <= high` each. The first three rows are its origin. The last three are its rotation, read
@@ -96,8 +96,8 @@ class PoseRows:
 class Function:
     """A user's constraint: a JAX function of its variables' values, one lane at a time, to `rows` numbers.
 
-    Configurations arrive as `(dof,)`, poses as `(7,)` `[x y z qw qx qy qz]`, each under the variable's name. `kind` says
-    whether the rows must be zero or at most zero.
+    Configurations and vectors arrive as `(dof,)`, poses as `(7,)` `[x y z qw qx qy qz]`, each under the variable's name.
+    `kind` says whether the rows must be zero or at most zero.
     """
 
     function: Callable[..., jax.Array]
@@ -107,6 +107,25 @@ class Function:
 
 
 Declaration = PoseRows | Function
+
+
+@dataclass(frozen=True)
+class OwnSampler:
+    """A user's direct sampler: a JAX function of a key and the values of `given`, one lane at a time, to `variables`.
+
+    Values arrive and leave as in `Function`. It returns one array if `single`, else one per variable in their order.
+    """
+
+    function: Callable[..., jax.Array | tuple[jax.Array, ...]]
+    variables: tuple[str, ...]
+    given: tuple[str, ...]
+    single: bool
+
+    def draw(self, key: jax.Array, given: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+        """Values by variable, for one lane."""
+        result = self.function(key, **given)
+        parts = (result,) if self.single else result
+        return {name: jnp.asarray(part, jnp.float32) for name, part in zip(self.variables, parts, strict=True)}
 
 
 class RowData(NamedTuple):

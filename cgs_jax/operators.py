@@ -21,12 +21,12 @@ from jax import lax
 
 from cgs_jax import augmented_lagrangian as al
 from cgs_jax.collisions import Body, ClearanceData, place_object, place_robot, smallest_distance
-from cgs_jax.constraints import PoseRows, Term, row_data
+from cgs_jax.constraints import OwnSampler, PoseRows, Term, row_data
 from cgs_jax.kinematics import Chain, joint_frames, padded, tool_pose, tool_poses_on_host
 from cgs_jax.plans import Layout, Plan, PlanSystem, Shared, make_plan
 from cgs_jax.poses import Array, Pose, compose, from_vector, inverse, to_vector
 from cgs_jax.problems import Params, Problem, pose_vector
-from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, pose_seed, uniforms
+from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, draw_own, pose_seed, uniforms
 from cgs_jax.transitions import Transition
 
 PENETRATION = 5e-5
@@ -109,7 +109,8 @@ def propose(
         u = uniforms(key, number, count_draws(layout))
         pose = from_vector(vector)
         pose = Pose(jnp.moveaxis(pose.rotation, 2, 0), jnp.moveaxis(pose.position, 1, 0))
-        return draw(layout, pose, q, numbers.tables, numbers.seeds, numbers.choices, shared, u)
+        own = draw_own(layout, key, number, vector, q)
+        return draw(layout, pose, q, numbers.tables, numbers.seeds, numbers.choices, shared, u, own)
 
     inputs = (numbers_of, vectors, configurations)
     blank = _blank(draw_chunk, tasks, SEED_CHUNK, inputs)
@@ -413,6 +414,8 @@ def _bind(problem: Problem, transition: Transition) -> Operator:
         {name: chain.offset.shape[0] for name, chain in problem.params.chains.items()},
         max([dof for dof in problem.dofs.values() if dof is not None], default=0),
         touches,
+        {name: _widths(*problem.params.limits[name]) for name in problem.vectors},
+        _samplers(problem, transition),
     )
     return Operator(
         new=transition.new,
@@ -425,6 +428,24 @@ def _bind(problem: Problem, transition: Transition) -> Operator:
         dofs=tuple(problem.dofs[name] or 0 for name in plan.configurations),
         identity=zlib.crc32(repr(transition.problem).encode()),
     )
+
+
+def _widths(low: Array, high: Array) -> tuple[float, ...]:
+    return tuple(float(b - a) for a, b in zip(low, high, strict=True))
+
+
+def _samplers(problem: Problem, transition: Transition) -> list[OwnSampler]:
+    """A user's samplers that draw here: all their variables are new, and what they are given is assigned or drawn before."""
+    chosen: list[OwnSampler] = []
+    known = set(transition.condition)
+    left = list(problem.samplers)
+    while True:
+        able = [s for s in left if set(s.variables) <= set(transition.new) and set(s.given) <= known]
+        if not able:
+            return chosen
+        chosen += able
+        left = [s for s in left if s not in able]
+        known |= {name for s in able for name in s.variables}
 
 
 def gather_given(operator: Operator, params: Params, values: Mapping[str, Array], tasks: int) -> Array:

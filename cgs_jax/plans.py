@@ -26,6 +26,7 @@ from cgs_jax.constraints import (
     Declaration,
     Function,
     FunctionArgument,
+    OwnSampler,
     PoseRows,
     Product,
     RowData,
@@ -48,6 +49,19 @@ class FunctionSlot(NamedTuple):
     constraint: int
 
 
+class SamplerSlot(NamedTuple):
+    """A user's sampler by position.
+
+    Arguments, in the order of its given variables: ("pose", given atom - 1, 7), ("configuration", position among those that
+    functions read, dof), or ("drawn", 0, 0) for what a sampler before it drew. Results, in the order of its variables:
+    ("free", free pose, 7) or ("configuration", new configuration, dof).
+    """
+
+    sampler: OwnSampler
+    arguments: tuple[tuple[str, int, int], ...]
+    results: tuple[tuple[str, int, int], ...]
+
+
 @dataclass(frozen=True)
 class Layout:
     """What a device program is compiled for. Atoms: identity, given poses, touch sites, tools, free poses."""
@@ -55,7 +69,7 @@ class Layout:
     joints: int
     """Joints of the longest chain; shorter ones are padded with joints that do not move."""
     configurations: int
-    """New configurations K, each a block of `joints` unknowns."""
+    """New configurations K, each a block of `joints` unknowns; a user's vector is one without tools."""
     chains: int
     """Tools per configuration."""
     free: int
@@ -76,6 +90,10 @@ class Layout:
     """Room for constraints in the report of violations."""
     functions: tuple[FunctionSlot, ...] = ()
     """A user's functions; a program that has any serves one problem only."""
+    samplers: tuple[SamplerSlot, ...] = ()
+    """A user's samplers, in the order in which they draw; a program that has any serves one problem only."""
+    ranges: tuple[tuple[float, ...], ...] = ()
+    """Per new configuration the widths (dof,) of a user's vector, () for a robot's; empty where all are robots'."""
 
     @property
     def unknowns(self) -> int:
@@ -105,7 +123,8 @@ class Layout:
     @property
     def solves(self) -> bool:
         """Whether there is anything to solve: without, drawing the free poses is all (and judging what is defined)."""
-        return bool(self.unknowns) and (bool(self.configurations or self.functions) or self.words > self.free)
+        closed_form = not (self.configurations or self.functions or self.samplers) and self.words <= self.free
+        return bool(self.unknowns) and not closed_form
 
 
 class Words(NamedTuple):
@@ -163,7 +182,7 @@ class Plan:
     poses: tuple[str, ...]
     """New pose variables in the order of the output words."""
     given_configurations: tuple[str, ...]
-    """Given configurations that a user's function reads."""
+    """Given configurations and vectors that a user's function or sampler reads."""
 
 
 def make_plan(
@@ -173,17 +192,21 @@ def make_plan(
     lengths: Mapping[str, int],
     joints: int,
     sites: int,
+    ranges: Mapping[str, tuple[float, ...]] | None = None,
+    samplers: Sequence[OwnSampler] = (),
 ) -> Plan:
     """Plans the conditional problem of `new` variables under active constraints.
 
     `dofs` has each configuration variable's number of joints, None for a pose; `lengths` the joints of each chain; `joints`
     and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). Poses are
     defined greedily: configurations are taken one by one, always the one that completes most products; where every loop left
-    has two or more unknown poses, one of them becomes free.
+    has two or more unknown poses, one of them becomes free. `ranges` has the widths of a user's vectors, which are planned as
+    configurations without tools; `samplers` those that draw here, in order: a pose that one draws is free from the start.
     """
     new_poses = [name for name in new if dofs[name] is None]
     new_configurations = [name for name in new if dofs[name] is not None]
-    free: list[str] = []
+    drawn = {name for sampler in samplers for name in sampler.variables}
+    free: list[str] = [name for name in new_poses if name in drawn]
     while True:
         order, defined, read, undetermined = _eliminate(new_configurations, new_poses, free, declarations)
         if not undetermined:
@@ -191,7 +214,9 @@ def make_plan(
         loops = [d for n, d in declarations.items() if isinstance(d, PoseRows) and d.form == "closed" and n not in read]
         stuck = [p for d in loops for p in d.scope if p in undetermined]
         free.append((stuck or undetermined)[0])
-    return _Assembler(order, new_poses, free, defined, read, declarations, dofs, lengths, joints, sites).plan()
+    return _Assembler(
+        order, new_poses, free, defined, read, declarations, dofs, lengths, joints, sites, ranges or {}, samplers
+    ).plan()
 
 
 class _Definition(NamedTuple):
@@ -277,9 +302,12 @@ class _Assembler:
         lengths: Mapping[str, int],
         joints: int,
         sites: int,
+        ranges: Mapping[str, tuple[float, ...]],
+        samplers: Sequence[OwnSampler],
     ) -> None:
         self.order, self.new_poses, self.free = order, new_poses, free
         self.declarations, self.dofs, self.lengths, self.joints, self.sites = declarations, dofs, lengths, joints, sites
+        self.ranges, self.samplers = ranges, samplers
         self.values: dict[str, Product] = {}
         for definition in defined:
             self.values[definition.pose] = self._substituted(definition.value)
@@ -321,6 +349,7 @@ class _Assembler:
                 tools[term.variable][term.name] = None
             elif term.kind != "pose" or term.name not in self.free:
                 given[Term(term.kind, term.name, term.variable)] = None
+        given |= dict.fromkeys(Term("pose", v) for v in self._read_by_samplers() if self.dofs[v] is None)
         chains = max([len(names) for names in tools.values()], default=1) or 1
         words = max(len(products), len(self.order) + len(self.free), 1)
         first_tool = 1 + _rounded(max(len(given), 1), 12) + self.sites
@@ -350,6 +379,8 @@ class _Assembler:
                 FunctionSlot(f, tuple(self._argument(v) for v in f.scope), constraints.index(name))
                 for name, f in self.functions.items()
             ),
+            samplers=tuple(self._sampler_slot(sampler, list(given)) for sampler in self.samplers),
+            ranges=tuple(self.ranges.get(name, ()) for name in self.order) if self.ranges.keys() & set(self.order) else (),
         )
         stage = np.full(words, len(self.order) + 1, np.int32)
         constraint = np.full(words, layout.constraints, np.int32)
@@ -378,8 +409,28 @@ class _Assembler:
         )
 
     def _function_configurations(self) -> list[str]:
-        scopes = [v for f in self.functions.values() for v in f.scope]
+        scopes = [v for f in self.functions.values() for v in f.scope] + self._read_by_samplers()
         return list(dict.fromkeys(v for v in scopes if self.dofs[v] is not None and v not in self.order))
+
+    def _read_by_samplers(self) -> list[str]:
+        """Given variables that samplers read."""
+        new = {*self.order, *self.new_poses}
+        return [name for sampler in self.samplers for name in sampler.given if name not in new]
+
+    def _sampler_slot(self, sampler: OwnSampler, given: list[Term]) -> SamplerSlot:
+        def argument(variable: str) -> tuple[str, int, int]:
+            dof = self.dofs[variable]
+            if variable in self.order or variable in self.new_poses:
+                return "drawn", 0, 0
+            if dof is None:
+                return "pose", given.index(Term("pose", variable)), 7
+            return "configuration", self._function_configurations().index(variable), dof
+
+        def result(variable: str) -> tuple[str, int, int]:
+            dof = self.dofs[variable]
+            return ("free", self.free.index(variable), 7) if dof is None else ("configuration", self.order.index(variable), dof)
+
+        return SamplerSlot(sampler, tuple(map(argument, sampler.given)), tuple(map(result, sampler.variables)))
 
     def _argument(self, variable: str) -> tuple[str, int, int]:
         dof = self.dofs[variable]
@@ -623,24 +674,38 @@ class PlanSystem:
                 arguments[name] = FunctionArgument(tasks.configurations[at - layout.configurations], None)
             else:
                 # Robots with fewer joints than the longest are padded.
-                identity = jnp.eye(size, layout.unknowns, at * layout.joints)[..., None]
-                arguments[name] = FunctionArgument(x.configurations[at, :size], identity)
+                tangent = jnp.eye(size, layout.unknowns, at * layout.joints)[..., None]
+                if layout.ranges and layout.ranges[at]:
+                    tangent = tangent * jnp.asarray(layout.ranges[at], tangent.dtype)[:, None, None]
+                arguments[name] = FunctionArgument(x.configurations[at, :size], tangent)
         return arguments
 
+    def _units(self) -> jax.Array | float:
+        """Change of each number of a configuration per unit of its unknown, `(configurations, joints, 1)`.
+
+        The solver takes a user's vector in units of its range: steps of one size must suit joints and newtons alike.
+        """
+        layout = self.layout
+        if not layout.ranges:
+            return 1.0
+        padded = [(*widths, *(1.0,) * (layout.joints - len(widths))) for widths in layout.ranges]
+        return jnp.asarray(padded, jnp.float32)[..., None]
+
     def room(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, jax.Array]:
-        """Joint limits; poses are unbounded."""
+        """Limits of joints and vectors; poses are unbounded."""
         tasks, _ = data
         lanes = tasks.slack.shape[-1]
         joints = self.layout.joints * self.layout.configurations
         unbounded = jnp.full((6 * self.layout.free, lanes), jnp.inf)
-        least = (tasks.low - x.configurations).reshape(joints, lanes)
-        most = (tasks.high - x.configurations).reshape(joints, lanes)
+        units = self._units()
+        least = ((tasks.low - x.configurations) / units).reshape(joints, lanes)
+        most = ((tasks.high - x.configurations) / units).reshape(joints, lanes)
         return jnp.concatenate([least, -unbounded]), jnp.concatenate([most, unbounded])
 
     def retract(self, x: Point, step: jax.Array) -> Point:
         """Adds to the configurations, moves the free poses."""
         joints = self.layout.joints * self.layout.configurations
-        q = x.configurations + step[:joints].reshape(x.configurations.shape)
+        q = x.configurations + self._units() * step[:joints].reshape(x.configurations.shape)
         if not self.layout.free:
             return Point(q, x.free)
         poses = [

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-import jax
 import mujoco
 import numpy as np
 
@@ -23,7 +22,7 @@ from cgs_jax.collisions import Body, Clearance, ClearanceData, Geom, pair_lists,
 from cgs_jax.constraints import (
     Declaration,
     Form,
-    Function,
+    OwnSampler,
     PoseRows,
     Product,
     RowData,
@@ -57,12 +56,12 @@ class Params(NamedTuple):
 
     constants: dict[str, Array]  # name -> (7,)
     chains: dict[str, Chain]  # "robot/frame"
-    limits: dict[str, tuple[Array, Array]]  # configuration variable -> (dof,), (dof,)
+    limits: dict[str, tuple[Array, Array]]  # configuration or vector variable -> (dof,), (dof,)
     rows: dict[str, RowData]  # by constraint
     seeds: dict[str, PoseSeed]  # by constraint on one pose alone
     sites: dict[str, Array]  # by constraint of touch: (sites, 7) T_object_site
     clearances: dict[str, ClearanceData]  # by constraint
-    tables: dict[str, RobotTable]  # "robot" or "robot, hanging"
+    tables: dict[str, RobotTable]  # "robot" or "robot, hanging"; by name for a vector variable, whose entries are not used
 
 
 class Exact(NamedTuple):
@@ -83,7 +82,7 @@ class Problem:
     clearances: Mapping[str, Clearance]
     """Bodies whose live pairs a constraint answers for; absent where there are none."""
     table_of: Mapping[str, str]
-    """Configuration variable to the name of its seed table."""
+    """Configuration or vector variable to the name of its seed table."""
     object_poses: Mapping[tuple[str, str], Product]
     """(object, switch) to its pose as a product."""
     base_poses: Mapping[tuple[str, str], Product]
@@ -92,6 +91,8 @@ class Problem:
     exact: Exact
     source: tuple[str, int] | None = None
     """Path of the task file and instance, if `load_problem` makes the same problem of them."""
+    samplers: tuple[OwnSampler, ...] = ()
+    """A user's direct samplers (`cgs_jax.with_sampler`)."""
     operators: dict = field(default_factory=dict, repr=False)
     """Operators by conditional problem, made on demand (`cgs_jax.operators.operator_of`)."""
 
@@ -102,8 +103,13 @@ class Problem:
 
     @functools.cached_property
     def dofs(self) -> dict[str, int | None]:
-        """Joints of each configuration variable; None for a pose."""
-        return {v.name: v.dof if v.kind == "configuration" else None for v in self.graph.variables}
+        """Numbers of each configuration or vector variable; None for a pose."""
+        return {v.name: None if v.kind == "pose" else v.dof for v in self.graph.variables}
+
+    @functools.cached_property
+    def vectors(self) -> tuple[str, ...]:
+        """A user's own variables (`cgs_jax.with_variable`)."""
+        return tuple(v.name for v in self.graph.variables if v.kind == "vector")
 
     @property
     def name(self) -> str:
@@ -123,82 +129,6 @@ def load_problem(name_or_path: str | Path, instance: int = 0) -> Problem:
 def build_problem(scene: Scene) -> Problem:
     """The problem of a loaded scene."""
     return _Builder(scene).build()
-
-
-def with_constraint(
-    problem: Problem,
-    name: str,
-    scope: Sequence[str],
-    function: Callable[..., jax.Array],
-    kind: Literal["equality", "inequality"],
-    rows: int,
-) -> Problem:
-    """The same problem with one more constraint: a plain JAX function of some of its variables.
-
-    function: called for one lane with the variables of `scope` by keyword, configurations as `(dof,)` in rad or m, poses as
-    `(7,)` `[x y z qw qx qy qz]`; returns `(rows,)` numbers that must be zero (kind "equality") or at most zero (kind
-    "inequality"), within the solver's tolerance. `rows` of an equality count as linearly independent (paper, Eq. 1); the
-    transitions are pruned anew. Numbers that the function closes over are part of its compiled programs.
-
-    Raises InputError (one line) when the name is taken, the scope unknown, kind or rows wrong, when at a random point the
-    function fails, returns another shape, or a value or derivative that is not finite, and when with the new rows no
-    sequence can assign all variables.
-    """
-    ordered = problem.graph.ordered(scope)
-    taken = [c.name for c in problem.graph.constraints]
-    if name in taken:
-        raise InputError(f"constraint '{name}' exists already, expected a name other than: {', '.join(taken)}")
-    if kind not in ("equality", "inequality"):
-        raise InputError(f"constraint '{name}' is of kind {kind!r}, expected one of: equality, inequality")
-    if isinstance(rows, bool) or not isinstance(rows, int) or rows < 1:
-        raise InputError(f"constraint '{name}' has {rows!r} rows, expected a whole number of at least 1")
-    if not ordered:
-        raise InputError(f"constraint '{name}' has an empty scope, expected some of: {', '.join(problem.graph.index)}")
-    declaration = Function(function, ordered, kind, rows)
-    _check_function(problem, name, declaration)
-    counts = (rows, 0) if kind == "equality" else (0, rows)
-    constraint = Constraint(name, name.split("(")[0], ordered, *counts)
-    graph = dataclasses.replace(problem.graph, constraints=(*problem.graph.constraints, constraint))
-    declarations = {**problem.declarations, name: declaration}
-    extended = dataclasses.replace(problem, graph=graph, declarations=declarations, operators={}, source=None)
-    if not extended.transitions.children(frozenset()):
-        raise InputError(
-            f"constraint '{name}' with {rows} {kind} rows leaves no sequence that assigns all variables; "
-            "expected no more equality rows than the degrees of freedom that the other constraints leave"
-        )
-    return extended
-
-
-def _check_function(problem: Problem, name: str, declaration: Function) -> None:
-    """Evaluates a user's function and its derivatives at a random point."""
-    rng = np.random.default_rng(0)
-    point = {}
-    for variable in declaration.scope:
-        if problem.dofs[variable] is None:
-            quat = rng.normal(size=4)
-            value = np.concatenate([rng.uniform(-1.0, 1.0, size=3), quat / np.linalg.norm(quat)])
-        else:
-            value = rng.uniform(*problem.params.limits[variable])
-        point[variable] = value.astype(np.float32)
-    try:
-        value = declaration.function(**point)
-        slopes = jax.jacfwd(lambda at: declaration.function(**at))(point)
-    except Exception as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise InputError(
-            f"function of constraint '{name}' failed with {type(error).__name__}: {reason}; expected a JAX function of "
-            f"the keywords {', '.join(declaration.scope)}"
-        ) from error
-    if np.shape(value) != (declaration.rows,):
-        raise InputError(
-            f"function of constraint '{name}' returns shape {np.shape(value)}, expected ({declaration.rows},)"
-        )
-    for what, numbers in (("value", [value]), ("derivative", jax.tree.leaves(slopes))):
-        if not all(np.isfinite(np.asarray(part)).all() for part in numbers):
-            raise InputError(
-                f"function of constraint '{name}' has a {what} that is not finite at a random point, "
-                "expected finite numbers everywhere within the limits"
-            )
 
 
 class _Builder:

@@ -1,14 +1,17 @@
 """Random seeds: where projections start from.
 
 Every lane's stream is a function of seed, operator and task number alone. Free poses are drawn from the constraint on them
-alone (grasp, region), in closed form. A configuration is the best of a few candidates by the residual of the rows that it
-completes: candidates come from a table of random configurations with their tool poses, so that judging one costs products of
-poses and no kinematics. A part of the lanes ignores the table and starts anywhere within the joint limits, so that every
-feasible point keeps a positive density.
+alone (grasp, region), in closed form; a user's vectors are uniform within their limits. A configuration is the best of a few
+candidates by the residual of the rows that it completes: candidates come from a table of random configurations with their tool
+poses, so that judging one costs products of poses and no kinematics. A part of the lanes ignores the table and starts anywhere
+within the joint limits, so that every feasible point keeps a positive density. What a user's own samplers draw takes the place
+of all this.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -17,7 +20,7 @@ import numpy as np
 from jax import lax
 
 from cgs_jax.constraints import Form
-from cgs_jax.plans import Layout, Point, Shared, Tasks, Words, all_atoms
+from cgs_jax.plans import Layout, Point, Shared, Tasks, Words, all_atoms, tools_at
 from cgs_jax.poses import Array, Pose, compose, from_quaternion, from_vector, inverse, matmul, matvec, rotation_exp, transpose
 
 CANDIDATES = 32
@@ -154,10 +157,12 @@ def draw(
     choices: SiteChoices,
     shared: Shared,
     u: jax.Array,
+    own: Mapping[str, jax.Array] = MappingProxyType({}),
 ) -> tuple[Point, Tasks]:
     """Seeds and task data for one chunk of lanes.
 
-    `given` has the poses of the given atoms, `(given, 3, 3, lanes)`; `u` is `(count_draws(layout), lanes)`.
+    `given` has the poses of the given atoms, `(given, 3, 3, lanes)`; `u` is `(count_draws(layout), lanes)`; `own` has what a
+    user's samplers drew (`draw_own`), which takes the place of our own seeds.
     """
     lanes = u.shape[1]
     taken = 0
@@ -172,6 +177,10 @@ def draw(
         pick = take(layout.sites)
         count = jnp.asarray(choices.count)[:, None]
         chosen = jnp.minimum((pick * count).astype(jnp.int32), count - 1)
+        for name, (kind, at, _) in _own_places(layout):
+            if kind == "free":
+                site = jnp.asarray(seeds.site)[at] - layout.first_site
+                chosen = jnp.where(jnp.arange(layout.sites)[:, None] == site, _nearest_site(choices, site, own[name]), chosen)
         vectors = jnp.take_along_axis(jnp.asarray(choices.poses), chosen[..., None], axis=1)  # (sites, lanes, 7)
         sites = from_vector(jnp.moveaxis(vectors, 2, 0))
         given = Pose(
@@ -179,6 +188,9 @@ def draw(
             jnp.concatenate([given.position, jnp.moveaxis(sites.position, 1, 0)]),
         )
     free = _draw_free(layout, given, seeds, [take(7) for _ in range(layout.free)], lanes)
+    for name, (kind, at, _) in _own_places(layout):
+        if kind == "free":
+            free = jax.tree.map(lambda all_, one, at=at: all_.at[at].set(one), free, _own_pose(own[name]))
     if not layout.configurations:
         none = jnp.zeros((0, 0, lanes))
         return Point(none, free), Tasks(given, none, none, slack, given_configurations)
@@ -188,12 +200,92 @@ def draw(
     pick, wander = take(layout.configurations), take(layout.configurations)[:, None]
     offset = take(layout.configurations * layout.joints).reshape(shape)
     narrow = take(layout.configurations * layout.joints).reshape(shape)
-    q = _choose(layout, given, free, tables, shared, pick)
+    fixed = {
+        at: _inside(own[name], low[at, :dof], high[at, :dof], layout.joints)
+        for name, (kind, at, dof) in _own_places(layout)
+        if kind == "configuration"
+    }
+    q = _choose(layout, given, free, tables, shared, pick, fixed)
     q = q + (2.0 * offset - 1.0) * JITTER * (high - low)
     q = jnp.where(wander < ANYWHERE, low + offset * (high - low), q)
     lower = low + LIMIT_SLACK * narrow * (high - low)
     upper = high - LIMIT_SLACK * (1.0 - narrow) * (high - low)
+    # A vector's seed is uniform, a user's own is its own: their limits make room for it.
+    exact = fixed | {
+        at: jnp.clip(low[at] + offset[at] * (high - low)[at], low[at], high[at])
+        for at, widths in enumerate(layout.ranges)
+        if widths and at not in fixed
+    }
+    for at, value in exact.items():
+        q = q.at[at].set(value)
+        lower = lower.at[at].min(value)
+        upper = upper.at[at].max(value)
     return Point(jnp.clip(q, lower, upper), free), Tasks(given, lower, upper, slack, given_configurations)
+
+
+SAMPLER_STREAM = 2**31
+"""First number of the streams of a user's samplers in a task's stream; further than any count of uniform numbers."""
+
+LIMIT_ROUNDING = 1e-6
+"""Rounding (relative to the limits) that a user's value may lie outside its limits."""
+
+
+def draw_own(
+    layout: Layout, key: jax.Array, numbers: jax.Array, given: jax.Array, configurations: tuple[jax.Array, ...]
+) -> dict[str, jax.Array]:
+    """What a user's samplers draw, `(dim, lanes)` by variable; each sees what those before it drew.
+
+    `numbers` `(lanes,)` are the tasks' numbers, `given` the vectors of the given atoms `(7, given, lanes)`, `configurations`
+    the given ones that functions read, `(dof, lanes)` each.
+    """
+    drawn: dict[str, jax.Array] = {}
+    for at, slot in enumerate(layout.samplers):
+
+        def value_of(name: str, kind: str, index: int) -> jax.Array:
+            if kind == "drawn":
+                return drawn[name]
+            return given[:, index] if kind == "pose" else configurations[index]
+
+        read = {
+            name: value_of(name, kind, index)
+            for name, (kind, index, _) in zip(slot.sampler.given, slot.arguments, strict=True)
+        }
+
+        def one_lane(number: jax.Array, point: dict[str, jax.Array]) -> dict[str, jax.Array]:
+            stream = jax.random.fold_in(jax.random.fold_in(key, number), SAMPLER_STREAM + at)
+            return slot.sampler.draw(stream, point)
+
+        drawn |= jax.vmap(one_lane, in_axes=(0, -1), out_axes=-1)(numbers, read)
+    return drawn
+
+
+def _own_places(layout: Layout) -> list[tuple[str, tuple[str, int, int]]]:
+    """Variables that a user's samplers draw, and where they are."""
+    return [place for slot in layout.samplers for place in zip(slot.sampler.variables, slot.results, strict=True)]
+
+
+def _own_pose(vector: jax.Array) -> Pose:
+    """A pose of a user's `(7, lanes)`, whose quaternion may be of any length."""
+    length = jnp.sqrt(jnp.sum(jnp.square(vector[3:]), axis=0))
+    return from_vector(jnp.concatenate([vector[:3], vector[3:] / length]))
+
+
+def _inside(value: jax.Array, low: jax.Array, high: jax.Array, joints: int) -> jax.Array:
+    """A user's value `(dof, lanes)` padded to `(joints, lanes)`; not a number, so that the task fails, outside the limits."""
+    room = LIMIT_ROUNDING * jnp.maximum(1.0, jnp.maximum(jnp.abs(low), jnp.abs(high)))
+    within = jnp.all((value >= low - room) & (value <= high + room), axis=0)
+    value = jnp.where(within, jnp.clip(value, low, high), jnp.nan)
+    return jnp.pad(value, ((0, joints - value.shape[0]), (0, 0)))
+
+
+def _nearest_site(choices: SiteChoices, site: jax.Array, held: jax.Array) -> jax.Array:
+    """The touch site `(lanes,)` of a site atom that is nearest to the gripper of poses `T_gripper_object` `(7, lanes)`."""
+    origin = inverse(_own_pose(held)).position
+    at = jnp.maximum(site, 0)
+    offered = jnp.asarray(choices.poses)[at, :, :3]
+    away = jnp.sum(jnp.square(offered[:, :, None] - origin[None]), axis=1)
+    away = jnp.where(jnp.arange(offered.shape[0])[:, None] < jnp.asarray(choices.count)[at], away, jnp.inf)
+    return jnp.argmin(away, axis=0).astype(jnp.int32)
 
 
 def _draw_free(layout: Layout, given: Pose, seeds: PoseSeed, draws: list[jax.Array], lanes: int) -> Pose:
@@ -256,12 +348,20 @@ def _around(
     return lax.fori_loop(0, words.length, multiply, start)
 
 
-def _choose(layout: Layout, given: Pose, free: Pose, tables: Tables, shared: Shared, pick: jax.Array) -> jax.Array:
+def _choose(
+    layout: Layout,
+    given: Pose,
+    free: Pose,
+    tables: Tables,
+    shared: Shared,
+    pick: jax.Array,
+    fixed: Mapping[int, jax.Array],
+) -> jax.Array:
     """For each new configuration in turn the best of `CANDIDATES` table entries, `(K, joints, lanes)`.
 
     A candidate is judged by the words that become known with it, earlier configurations and free poses given: squared
     distance of the origin and of the dot products to their intervals, `2 (1 - cos)` for a rotation vector. Candidates are the
-    last axis here.
+    last axis here. Configurations `(joints, lanes)` in `fixed` are there already, for those after them to be judged by.
     """
     code, lanes = shared.code, pick.shape[1]
     size = tables.configurations.shape[-1]
@@ -269,6 +369,10 @@ def _choose(layout: Layout, given: Pose, free: Pose, tables: Tables, shared: Sha
     atoms = all_atoms(given, nothing, free)
     all_rotation, all_position = jnp.asarray(tables.rotation), jnp.asarray(tables.position)
     stages = jnp.asarray(code.stage)
+    if fixed:
+        known = jnp.stack([fixed.get(k, jnp.zeros((layout.joints, lanes))) for k in range(layout.configurations)])
+        own, _ = tools_at(layout, shared.chains, known)
+        is_own = jnp.asarray([k in fixed for k in range(layout.configurations)])
 
     def stage(k: jax.Array, state: tuple[Pose, jax.Array]) -> tuple[Pose, jax.Array]:
         atoms, chosen = state
@@ -313,6 +417,8 @@ def _choose(layout: Layout, given: Pose, free: Pose, tables: Tables, shared: Sha
         for j in range(layout.chains):
             e = k * layout.chains + j
             turn, move = jnp.take(all_rotation[e], entry, axis=-1), jnp.take(all_position[e], entry, axis=-1)
+            if fixed:
+                turn, move = jnp.where(is_own[k], own.rotation[e], turn), jnp.where(is_own[k], own.position[e], move)
             rotation = lax.dynamic_update_index_in_dim(rotation, turn, first + j, 0)
             position = lax.dynamic_update_index_in_dim(position, move, first + j, 0)
         return Pose(rotation, position), chosen.at[k].set(entry)

@@ -47,8 +47,9 @@ MAY_IMPORT = {
     "problems": {"errors", "graph", "transitions", "scene"} | MATHEMATICS,
     "operators": {"errors", "problems", "transitions"} | MATHEMATICS,
     "keyframes": {"constraints", "kinematics", "problems"},
+    "own": {"audit", "constraints", "errors", "graph", "problems"},
     "batches": {
-        "audit", "augmented_lagrangian", "keyframes", "operators", "problems", "programs", "scene", "transitions",
+        "audit", "augmented_lagrangian", "keyframes", "operators", "own", "problems", "programs", "scene", "transitions",
     },
     "worker": {"errors", "audit", "batches", "problems", "programs"},
     "sampler": {
