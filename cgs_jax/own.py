@@ -299,7 +299,9 @@ def _check_sampler(problem: Problem, label: str, sampler: OwnSampler) -> None:
             continue
         if problem.dofs[name] is None:
             if np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0).max() > 1e-3:
-                raise InputError(f"function of the {label} returns '{name}' with quaternions that are not unit, expected unit ones")
+                raise InputError(
+                    f"function of the {label} returns '{name}' with quaternions that are not unit, expected unit ones"
+                )
         else:
             low, high = (np.asarray(bound) for bound in problem.params.limits[name])
             if not ((values >= low) & (values <= high)).all(axis=1).any():

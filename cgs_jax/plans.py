@@ -92,8 +92,10 @@ class Layout:
     """A user's functions; a program that has any serves one problem only."""
     samplers: tuple[SamplerSlot, ...] = ()
     """A user's samplers, in the order in which they draw; a program that has any serves one problem only."""
-    ranges: tuple[tuple[float, ...], ...] = ()
-    """Per new configuration the widths (dof,) of a user's vector, () for a robot's; empty where all are robots'."""
+    vectors: tuple[int, ...] = ()
+    """Which of the new configurations are a user's vectors."""
+    units: tuple[float, ...] = ()
+    """Change of each number per unit of its unknown (n,); empty where all are one."""
 
     @property
     def unknowns(self) -> int:
@@ -156,6 +158,10 @@ class Code(NamedTuple):
     stage: Array  # (words,) int32 number of configurations that a word needs
     constraint: Array  # (words,) int32 position of its constraint; `constraints` where it has none
 
+
+SAMPLED_UNIT = 0.05
+"""Unit of the unknowns that a user's sampler drew: a least-norm step moves them by this squared of what it moves others that
+could do as well, so that they stay near what was drawn wherever the others can solve the rest."""
 
 OUTPUTS = 4
 """Room for new poses in the output of a program; problems with fewer share it."""
@@ -380,7 +386,8 @@ class _Assembler:
                 for name, f in self.functions.items()
             ),
             samplers=tuple(self._sampler_slot(sampler, list(given)) for sampler in self.samplers),
-            ranges=tuple(self.ranges.get(name, ()) for name in self.order) if self.ranges.keys() & set(self.order) else (),
+            vectors=tuple(k for k, name in enumerate(self.order) if name in self.ranges),
+            units=self._units(),
         )
         stage = np.full(words, len(self.order) + 1, np.int32)
         constraint = np.full(words, layout.constraints, np.int32)
@@ -416,6 +423,19 @@ class _Assembler:
         """Given variables that samplers read."""
         new = {*self.order, *self.new_poses}
         return [name for sampler in self.samplers for name in sampler.given if name not in new]
+
+    def _units(self) -> tuple[float, ...]:
+        """A vector's unit is its range: steps of one size must suit joints and newtons alike. What a sampler drew is stiff."""
+        drawn = {name for sampler in self.samplers for name in sampler.variables}
+        if not drawn | (self.ranges.keys() & set(self.order)):
+            return ()
+        units: list[float] = []
+        for name in (*self.order, *self.free):
+            size = self.joints if name in self.order else 6
+            own = self.ranges.get(name, ())
+            widths = (*own, *(1.0,) * (size - len(own)))
+            units += [SAMPLED_UNIT * width if name in drawn else width for width in widths]
+        return tuple(units)
 
     def _sampler_slot(self, sampler: OwnSampler, given: list[Term]) -> SamplerSlot:
         def argument(variable: str) -> tuple[str, int, int]:
@@ -659,6 +679,7 @@ class PlanSystem:
             high = jnp.concatenate([high, jnp.zeros((size, 1))])
         width = high - low
         inside = jnp.where(jnp.isfinite(width), 0.5 * width, 0.0)
+        jacobian = jacobian * self._units()
         return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
 
     def _arguments(
@@ -674,22 +695,13 @@ class PlanSystem:
                 arguments[name] = FunctionArgument(tasks.configurations[at - layout.configurations], None)
             else:
                 # Robots with fewer joints than the longest are padded.
-                tangent = jnp.eye(size, layout.unknowns, at * layout.joints)[..., None]
-                if layout.ranges and layout.ranges[at]:
-                    tangent = tangent * jnp.asarray(layout.ranges[at], tangent.dtype)[:, None, None]
-                arguments[name] = FunctionArgument(x.configurations[at, :size], tangent)
+                identity = jnp.eye(size, layout.unknowns, at * layout.joints)[..., None]
+                arguments[name] = FunctionArgument(x.configurations[at, :size], identity)
         return arguments
 
     def _units(self) -> jax.Array | float:
-        """Change of each number of a configuration per unit of its unknown, `(configurations, joints, 1)`.
-
-        The solver takes a user's vector in units of its range: steps of one size must suit joints and newtons alike.
-        """
-        layout = self.layout
-        if not layout.ranges:
-            return 1.0
-        padded = [(*widths, *(1.0,) * (layout.joints - len(widths))) for widths in layout.ranges]
-        return jnp.asarray(padded, jnp.float32)[..., None]
+        """`Layout.units` as `(n, 1)`."""
+        return jnp.asarray(self.layout.units)[:, None] if self.layout.units else 1.0
 
     def room(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, jax.Array]:
         """Limits of joints and vectors; poses are unbounded."""
@@ -697,15 +709,16 @@ class PlanSystem:
         lanes = tasks.slack.shape[-1]
         joints = self.layout.joints * self.layout.configurations
         unbounded = jnp.full((6 * self.layout.free, lanes), jnp.inf)
+        least = (tasks.low - x.configurations).reshape(joints, lanes)
+        most = (tasks.high - x.configurations).reshape(joints, lanes)
         units = self._units()
-        least = ((tasks.low - x.configurations) / units).reshape(joints, lanes)
-        most = ((tasks.high - x.configurations) / units).reshape(joints, lanes)
-        return jnp.concatenate([least, -unbounded]), jnp.concatenate([most, unbounded])
+        return jnp.concatenate([least, -unbounded]) / units, jnp.concatenate([most, unbounded]) / units
 
     def retract(self, x: Point, step: jax.Array) -> Point:
         """Adds to the configurations, moves the free poses."""
         joints = self.layout.joints * self.layout.configurations
-        q = x.configurations + self._units() * step[:joints].reshape(x.configurations.shape)
+        step = step * self._units()
+        q = x.configurations + step[:joints].reshape(x.configurations.shape)
         if not self.layout.free:
             return Point(q, x.free)
         poses = [

@@ -213,8 +213,8 @@ def draw(
     # A vector's seed is uniform, a user's own is its own: their limits make room for it.
     exact = fixed | {
         at: jnp.clip(low[at] + offset[at] * (high - low)[at], low[at], high[at])
-        for at, widths in enumerate(layout.ranges)
-        if widths and at not in fixed
+        for at in layout.vectors
+        if at not in fixed
     }
     for at, value in exact.items():
         q = q.at[at].set(value)
