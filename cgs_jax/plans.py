@@ -214,7 +214,7 @@ def make_plan(
     drawn = {name for sampler in samplers for name in sampler.variables}
     free: list[str] = [name for name in new_poses if name in drawn]
     while True:
-        order, defined, read, undetermined = _eliminate(new_configurations, new_poses, free, declarations)
+        order, defined, read, undetermined = _eliminate(new_configurations, new_poses, free, drawn, declarations)
         if not undetermined:
             break
         loops = [d for n, d in declarations.items() if isinstance(d, PoseRows) and d.form == "closed" and n not in read]
@@ -233,7 +233,11 @@ class _Definition(NamedTuple):
 
 
 def _eliminate(
-    configurations: list[str], poses: list[str], free: list[str], declarations: Mapping[str, Declaration]
+    configurations: list[str],
+    poses: list[str],
+    free: list[str],
+    drawn: set[str],
+    declarations: Mapping[str, Declaration],
 ) -> tuple[list[str], list[_Definition], dict[str, int], list[str]]:
     """Order of configurations; definitions in order; constraints read as rows with their stage; poses left undetermined."""
     new = {*configurations, *poses}
@@ -265,9 +269,10 @@ def _eliminate(
     order: list[str] = []
     while len(order) < len(configurations):
 
-        def completes(candidate: str) -> int:
+        def completes(candidate: str) -> tuple[bool, int]:
+            # What a user's sampler draws is there for the others to be judged by.
             found, rows = propagate(known | {candidate}, set(used), 0)
-            return len(found) + len(rows)
+            return candidate in drawn, len(found) + len(rows)
 
         best = max((c for c in configurations if c not in order), key=completes)
         order.append(best)
