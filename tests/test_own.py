@@ -196,12 +196,13 @@ def test_a_sampler_reads_what_is_assigned_and_what_was_drawn_before_it():
 def test_samplers_of_configurations_are_the_seeds_that_others_are_judged_by(monkeypatch):
     monkeypatch.setattr(seeds, "JITTER", 0.0)
     monkeypatch.setattr(seeds, "ANYWHERE", 0.0)
-    middle, reach = jnp.array([0.0, 0.0, 0.0, -2.0, 0.0, 2.0, 0.0]), 0.5
-    at = cgs_jax.with_sampler(problem("pick_place"), "q2", lambda key: middle + reach * jax.random.uniform(key, (7,)))
+    low, high = map(jnp.asarray, problem("pick_place").params.limits["q2"])
+    half = 0.5 * (low + high)
+    at = cgs_jax.with_sampler(problem("pick_place"), "q2", lambda key: jax.random.uniform(key, (7,), minval=low, maxval=half))
     operator, numbers, point, data = seeds_of(at, (), ("q1", "q2", "t"))
     assert operator.plan.configurations == ("q2", "q1")
-    q2 = np.asarray(point.configurations[0]) - np.asarray(middle)[:, None]
-    assert q2.min() >= -1e-6 and q2.max() <= reach + 1e-6 and np.ptp(q2, axis=1).min() > 0.9 * reach
+    for joint, values in enumerate(np.asarray(point.configurations[0])):
+        assert stats.kstest(values, stats.uniform(low[joint], (half - low)[joint]).cdf).pvalue > 0.001
     rows = jax.jit(lambda q: PlanSystem(operator.plan.layout).rows(point._replace(configurations=q), (data, numbers.shared)))
 
     def residual(q):
