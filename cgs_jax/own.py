@@ -116,7 +116,8 @@ def with_sampler(
 
     What it draws is the seed of these variables in every operator that assigns all of them, where `given` are assigned already
     or drawn by another sampler there. From there the solver projects as always: an operator that assigns nothing else and
-    whose constraints the values satisfy returns them as they are; one that assigns other variables with them may move them.
+    whose constraints the values satisfy returns them as they are; one that assigns other variables with them may move them a
+    little, and only as far as the others cannot do the rest (`plans.SAMPLED_UNIT`).
     Elsewhere seeds are the usual ones. Constraints are checked in any case, so that what a sampler gets wrong costs attempts
     and never correctness. Given variables that no constraint ties to the drawn ones are tied by one without rows.
 

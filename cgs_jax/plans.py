@@ -684,7 +684,7 @@ class PlanSystem:
             high = jnp.concatenate([high, jnp.zeros((size, 1))])
         width = high - low
         inside = jnp.where(jnp.isfinite(width), 0.5 * width, 0.0)
-        jacobian = jacobian * self._units()
+        jacobian = self._times_units(jacobian)
         return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
 
     def _arguments(
@@ -704,9 +704,9 @@ class PlanSystem:
                 arguments[name] = FunctionArgument(x.configurations[at, :size], identity)
         return arguments
 
-    def _units(self) -> jax.Array | float:
-        """`Layout.units` as `(n, 1)`."""
-        return jnp.asarray(self.layout.units)[:, None] if self.layout.units else 1.0
+    def _times_units(self, by_unknown: jax.Array) -> jax.Array:
+        """`(..., n, lanes)` with each unknown times its unit."""
+        return by_unknown * jnp.asarray(self.layout.units)[:, None] if self.layout.units else by_unknown
 
     def room(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, jax.Array]:
         """Limits of joints and vectors; poses are unbounded."""
@@ -716,13 +716,16 @@ class PlanSystem:
         unbounded = jnp.full((6 * self.layout.free, lanes), jnp.inf)
         least = (tasks.low - x.configurations).reshape(joints, lanes)
         most = (tasks.high - x.configurations).reshape(joints, lanes)
-        units = self._units()
-        return jnp.concatenate([least, -unbounded]) / units, jnp.concatenate([most, unbounded]) / units
+        room = jnp.concatenate([least, -unbounded]), jnp.concatenate([most, unbounded])
+        if not self.layout.units:
+            return room
+        units = jnp.asarray(self.layout.units)[:, None]
+        return room[0] / units, room[1] / units
 
     def retract(self, x: Point, step: jax.Array) -> Point:
         """Adds to the configurations, moves the free poses."""
         joints = self.layout.joints * self.layout.configurations
-        step = step * self._units()
+        step = self._times_units(step)
         q = x.configurations + step[:joints].reshape(x.configurations.shape)
         if not self.layout.free:
             return Point(q, x.free)
