@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from cgs_jax import augmented_lagrangian as al
+from cgs_jax.coverage import CoverageGain
 from cgs_jax.errors import InputError
 from cgs_jax.operators import PENETRATION, clearance, gather_given, gather_poses, operator_of, propose
 from cgs_jax.poses import Array
 from cgs_jax.problems import Params, Problem
-from cgs_jax.record import Recorder, sample_set
-from cgs_jax.sampler import Event, Found, Sampler, SamplerSettings
+from cgs_jax.record import Recorder
+from cgs_jax.sampler import Event, Finished, Found, Sampler, SamplerSettings
 from cgs_jax.samples import SampleSet
 from cgs_jax.transitions import Transition
 from cgs_jax.uct import Chooser, Fixed, Random, Tree
@@ -74,14 +76,34 @@ def load_tree(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def check_budget(time_budget: float, num_samples: int | None, batch_size: int) -> None:
+def check_budget(time_budget: float, num_samples: int | None, coverage_gain: float | None, batch_size: int) -> None:
     """Raises InputError for budgets and sizes that make no sense."""
     if not time_budget > 0:
         raise InputError(f"time budget is {time_budget} s, expected more than 0")
     if num_samples is not None and num_samples < 1:
         raise InputError(f"number of samples is {num_samples}, expected at least 1")
+    if coverage_gain is not None and not 0 < coverage_gain < 1:
+        raise InputError(f"coverage gain is {coverage_gain}, expected a share between 0 and 1")
     if batch_size < 1:
         raise InputError(f"batch size is {batch_size}, expected at least 1")
+
+
+class RunOptions(TypedDict, total=False):
+    """What a run can be told beside its problem and its budget.
+
+    method: see `make_chooser`; "tree" where left out.
+    seed: of all random numbers; 0 where left out.
+    settings: how the run is scheduled.
+    prior: trees of earlier runs, for the method "tree-warm".
+    c_uct, reward: weight of exploration and reading of the paper's cost, see `make_chooser`.
+    """
+
+    method: str
+    seed: int
+    settings: SamplerSettings | None
+    prior: Sequence[Mapping[str, Any]]
+    c_uct: float | None
+    reward: Literal["rate", "rollout"]
 
 
 class Run:
@@ -94,17 +116,37 @@ class Run:
         seed: int = 0,
         settings: SamplerSettings | None = None,
         prior: Sequence[Mapping[str, Any]] = (),
-        **chooser_options: Any,
+        c_uct: float | None = None,
+        reward: Literal["rate", "rollout"] = "rate",
     ) -> None:
+        """The options are told at `RunOptions`."""
         settings = settings or SamplerSettings()
-        chooser = make_chooser(problem, method, seed, prior, pools=settings.pools, **chooser_options)
+        chooser = make_chooser(problem, method, seed, prior, c_uct, reward, settings.pools)
+        self.problem = problem
         self.sampler = Sampler(problem, chooser, seed, settings)
         self.record = Recorder(problem, chooser, method, seed, settings, self.sampler.auditor)
 
-    def events(self, time_budget: float, num_samples: int | None = None) -> Iterator[Event]:
-        """Drives the run; every event has been recorded when it is yielded."""
-        check_budget(time_budget, num_samples, self.sampler.settings.batch_size)
+    def events(
+        self, time_budget: float = 10.0, num_samples: int | None = None, coverage_gain: float | None = None
+    ) -> Iterator[Event]:
+        """Drives the run until the first of its budgets is used up; every event has been recorded when it is yielded.
+
+        time_budget: seconds of sampling, from the moment the first operators are ready.
+        num_samples: samples.
+        coverage_gain: share of the latest samples (`coverage.GAIN_WINDOW`) that were the first in their cell; the run ends
+            once it is below this for every variable (`coverage.CoverageGain`).
+        """
+        check_budget(time_budget, num_samples, coverage_gain, self.sampler.settings.batch_size)
+        gain = CoverageGain({variable.name: variable.kind for variable in self.problem.graph.variables})
+        covered = False
         for event in self.sampler.events(time_budget, num_samples):
+            if coverage_gain is not None and isinstance(event, Found):
+                gain.add(event.values)
+                if gain.share < coverage_gain:
+                    covered = True
+                    self.stop()
+            if covered and isinstance(event, Finished):
+                event = replace(event, reason="coverage")
             self.record.listen(event)
             yield event
 
@@ -117,18 +159,16 @@ def sample(
     problem: Problem,
     time_budget: float = 10.0,
     num_samples: int | None = None,
-    method: str = "tree",
-    seed: int = 0,
-    prior: Sequence[Mapping[str, Any]] = (),
-    settings: SamplerSettings | None = None,
+    coverage_gain: float | None = None,
+    **options: Unpack[RunOptions],
 ) -> SampleSet:
-    """Samples a problem for a time (s of sampling, from the moment the first operators are ready) or up to a number.
+    """Samples a problem until the first of its budgets is used up (`Run.events`).
 
     Every sample passed the double-precision audit. The result may be empty. Raises InputError for a wrong method or budget.
     Paper, Algorithm 1.
     """
-    run = Run(problem, method, seed, settings, prior)
-    for _ in run.events(time_budget, num_samples):
+    run = Run(problem, **options)
+    for _ in run.events(time_budget, num_samples, coverage_gain):
         pass
     return run.record.samples()
 
@@ -137,17 +177,14 @@ def stream(
     problem: Problem,
     time_budget: float = 10.0,
     num_samples: int | None = None,
-    method: str = "tree",
-    seed: int = 0,
-    prior: Sequence[Mapping[str, Any]] = (),
-    settings: SamplerSettings | None = None,
+    coverage_gain: float | None = None,
+    **options: Unpack[RunOptions],
 ) -> Iterator[SampleSet]:
     """Like `sample`, but yields verified samples in batches as they come."""
-    run = Run(problem, method, seed, settings, prior)
-    names = run.sampler.auditor.constraints
-    for event in run.events(time_budget, num_samples):
+    run = Run(problem, **options)
+    for event in run.events(time_budget, num_samples, coverage_gain):
         if isinstance(event, Found) and len(event.qpos):
-            yield sample_set(problem, [event], run.record.meta(), names)
+            yield run.record.samples([event])
 
 
 # ------------------------------------------------------------------ pure functions

@@ -32,6 +32,10 @@ FILL = (0.2, 0.6)
 """Share of a reference's cells to occupy: below it, cells only count samples; above it, every method looks the same."""
 
 
+GAIN_WINDOW = 1000
+"""Latest samples over which `CoverageGain` is taken."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """Edge lengths of a cell. Raises InputError unless all are positive.
@@ -89,6 +93,36 @@ def cell_indices(values: Values, cell: Cell, kind: str | None = None) -> NDArray
         return np.floor(values / cell.joint).astype(np.int64)
     position = np.floor(values[:, :3] / cell.position).astype(np.int64)
     return np.concatenate([position, _rotation_cells(values[:, 3:], cell.rotation)], axis=1)
+
+
+class CoverageGain:
+    """Whether more samples still show anything new: follows the samples of a run in batches, as they come.
+
+    `share` is, of the latest `window` samples, the share that was the first of the run in its cell, for the variable for which
+    it is largest; 1 while there are fewer samples than that. Where samples are drawn alike it is the chance, over that window,
+    that a sample reaches a cell that none has reached before.
+    """
+
+    def __init__(self, kinds: Mapping[str, str], cell: Cell | None = None, window: int = GAIN_WINDOW) -> None:
+        """kinds: "configuration", "vector" or "pose" by variable."""
+        self._kinds, self._cell, self._window = dict(kinds), cell or Cell(), window
+        self._known: dict[str, set[Any]] = {name: set() for name in kinds}
+        self._first: dict[str, NDArray[np.bool_]] = {name: np.ones(window, dtype=bool) for name in kinds}
+
+    def add(self, values: Mapping[str, Values]) -> None:
+        """Takes a batch (N, dim) by variable in."""
+        for name, known in self._known.items():
+            cells, at = np.unique(_opaque(cell_indices(values[name], self._cell, self._kinds[name])), return_index=True)
+            fresh = [cell not in known for cell in cells.tolist()]
+            first = np.zeros(len(values[name]), dtype=bool)
+            first[at[fresh]] = True
+            known.update(cells.tolist())
+            self._first[name] = np.concatenate([self._first[name], first])[-self._window :]
+
+    @property
+    def share(self) -> float:
+        """Between 0 and 1."""
+        return max(float(first.mean()) for first in self._first.values())
 
 
 def _rotation_cells(quaternions: Values, size: float) -> NDArray[np.int64]:
@@ -335,10 +369,15 @@ def _cell_of(name: str, cell: Cell | Mapping[str, Cell]) -> Cell:
 
 def _cells(values: Values, cell: Cell, kind: str | None) -> NDArray[np.void]:
     """Occupied cells, each once, as one opaque item per cell: sorting bytes is faster than sorting rows."""
-    indices = np.ascontiguousarray(cell_indices(values, cell, kind))
-    if not indices.size:
-        return np.zeros(min(len(indices), 1), dtype="V1")
-    return np.unique(indices.view(np.dtype((np.void, indices.itemsize * indices.shape[1]))).reshape(-1))
+    return np.unique(_opaque(cell_indices(values, cell, kind)))
+
+
+def _opaque(indices: NDArray[np.int64]) -> NDArray[np.void]:
+    """Rows (N, columns) as N opaque items; a variable without columns has one cell."""
+    if not indices.shape[1]:
+        return np.zeros(len(indices), dtype="V1")
+    indices = np.ascontiguousarray(indices)
+    return indices.view(np.dtype((np.void, indices.itemsize * indices.shape[1]))).reshape(-1)
 
 
 def _fill(samples: Values, reference: Values, cell: Cell, kind: str | None) -> float:

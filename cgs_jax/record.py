@@ -17,7 +17,7 @@ from cgs_jax.audit import Auditor
 from cgs_jax.coverage import duplicate_share, limit_share
 from cgs_jax.problems import Problem
 from cgs_jax.sampler import Compiled, Event, Finished, Found, Ran, SamplerSettings, Started
-from cgs_jax.samples import SampleSet
+from cgs_jax.samples import PARTS, SampleSet, remove_parts
 from cgs_jax.scene import attachments, goals, placements
 from cgs_jax.transitions import Transition
 from cgs_jax.uct import Chooser
@@ -97,6 +97,7 @@ class Recorder:
         self.count = self.rejected = 0
         self.reason: str | None = None
         self._found: list[Found] = []
+        self._appended = self._parts = 0
 
     def listen(self, event: Event) -> None:
         """Takes one event in."""
@@ -149,9 +150,9 @@ class Recorder:
             for path, rate in self.chooser.best_sequences(count)
         ]
 
-    def samples(self) -> SampleSet:
-        """The samples found so far."""
-        return sample_set(self.problem, self._found, self.meta(), self._columns)
+    def samples(self, found: list[Found] | None = None) -> SampleSet:
+        """The samples found so far, or those of some events."""
+        return sample_set(self.problem, self._found if found is None else found, self.meta(), self._columns)
 
     def meta(self) -> dict[str, Any]:
         """Description of the run, JSON-ready (`meta` of schema cgs_jax/1)."""
@@ -234,13 +235,14 @@ class Recorder:
     def save(self, folder: str | os.PathLike[str], samples: SampleSet | None = None) -> Path:
         """Writes samples.npz (if there is a sample), tree.json and run.json into a folder; returns the folder.
 
-        samples: what is to be written in place of all that were found.
+        samples: what is to be written in place of all that were found. Parts that were appended before are removed.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         samples = self.samples() if samples is None else samples
         if len(samples):
             samples.save(folder / "samples.npz")
+        remove_parts(folder)
         self.save_tree(folder / "tree.json")
         results = {
             "samples_written": len(samples),
@@ -250,6 +252,17 @@ class Recorder:
         }
         write_json(folder / "run.json", self.meta() | results | self.profile())
         return folder
+
+    def append(self, folder: str | os.PathLike[str]) -> None:
+        """Writes the samples found since the last call as one more part, which `SampleSet.load` reads if the run is killed.
+
+        Raises InputError when it cannot be written.
+        """
+        found = self._found[self._appended :]
+        self._appended = len(self._found)
+        if any(len(event.qpos) for event in found):
+            self.samples(found).save(Path(folder) / PARTS / f"{self._parts:06d}.npz")
+            self._parts += 1
 
     def save_tree(self, path: str | os.PathLike[str]) -> None:
         """Writes the statistics that the chooser gathered, for `load_tree`."""

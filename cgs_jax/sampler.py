@@ -91,7 +91,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Finished:
-    """The run ended: by "time", "samples" or "interrupt"."""
+    """The run ended: by "time", "samples" or "interrupt"; `Run` tells an interrupt of its own as "coverage"."""
 
     reason: str
     elapsed: float

@@ -5,6 +5,7 @@ Poses are `[x y z qw qx qy qz]`, metres, quaternion w first. N samples, K mode s
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import tempfile
@@ -21,6 +22,9 @@ from numpy.typing import NDArray
 from cgs_jax.errors import InputError
 
 SCHEMA = "cgs_jax/1"
+
+PARTS = "samples.parts"
+"""Folder beside samples.npz where a run puts what it has found, as numbered sample files, until it ends."""
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -240,11 +244,15 @@ class SampleSet:
     def load(cls, path: str | os.PathLike[str]) -> SampleSet:
         """Read a file that `save` wrote, or the `samples.npz` of a directory.
 
-        Raises InputError when it is missing, no such file, damaged, or of another schema.
+        Where a run was killed, or is still under way, the parts beside are put together in its place; `meta["ended_by"]` is
+        then None. Raises InputError when it is missing, no such file, damaged, or of another schema.
         """
         source = Path(path)
         if source.is_dir():
             source = source / "samples.npz"
+        if source.name == "samples.npz" and not source.exists() and part_files(source.parent):
+            parts = [cls.load(part) for part in part_files(source.parent)]
+            return replace(cls.concatenate(parts), meta=parts[-1].meta)
         try:
             with np.load(source, allow_pickle=False) as archive:
                 if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -282,6 +290,20 @@ class SampleSet:
             )
         except (ValueError, TypeError) as error:
             raise InputError(f"{source} is damaged: {str(error).splitlines()[0]}") from None
+
+
+def part_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """Sample files of a run that has not ended, in order."""
+    return sorted((Path(folder) / PARTS).glob("[0-9]*.npz"))
+
+
+def remove_parts(folder: str | os.PathLike[str]) -> None:
+    """Removes them, also one that was being written when the run was killed, and their folder when nothing else is in it."""
+    place = Path(folder) / PARTS
+    for path in (*part_files(folder), *place.glob(".[0-9]*.npz.*")):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        place.rmdir()
 
 
 def kind_of(values: NDArray[Any]) -> str:

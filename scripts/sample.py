@@ -4,7 +4,7 @@
     python scripts/sample.py --scene handover --instance 3 --time-budget 30 --out runs/mine
     python scripts/sample.py --scene handover --method "p; t_a; t_b; q_a1; q_a2; q_b2; q_b1"
 
-Writes samples.npz, tree.json and run.json. Exit status: 0 with at least one sample (also after Ctrl-C), 3 with none (one
+Writes samples.npz, tree.json and run.json; while it runs, what it has found to samples.parts. Exit status: 0 with at least one sample (also after Ctrl-C), 3 with none (one
 line says which operator and constraint stopped it), 2 for bad input.
 """
 
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 TREES = ("tree", "tree-warm")
 WRITTEN = ("samples.npz", "tree.json", "run.json", "profile.json", "samples_sheet.png", "samples.gif")
 
+APPEND_SECONDS = 1.0
+"""Sampling time from one part on disk to the next: what a killed run loses at most."""
+
 
 class Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
@@ -58,6 +61,12 @@ def parser() -> Parser:
     budget = parse.add_argument_group("how long")
     budget.add_argument("--time-budget", type=float, default=10.0, metavar="S", help="seconds of sampling (default 10)")
     budget.add_argument("--num-samples", type=int, metavar="N", help="stop at this many samples")
+    budget.add_argument(
+        "--coverage-gain",
+        type=float,
+        metavar="X",
+        help="stop when, of the last 1000 samples, a share below X (0 to 1) shows a new value of any variable",
+    )
 
     search = parse.add_argument_group("how")
     search.add_argument(
@@ -112,6 +121,8 @@ def check_numbers(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+    if options.coverage_gain is not None and not 0 < options.coverage_gain < 1:
+        raise InputError(f"--coverage-gain is {options.coverage_gain:g}, expected a share between 0 and 1")
     if not 0 <= options.seed < 2**32:
         raise InputError(f"--seed is {options.seed}, expected 0 to {2**32 - 1}")
     if options.c_uct is not None and not (options.c_uct > 0 and math.isfinite(options.c_uct)):
@@ -254,14 +265,17 @@ def run(options: argparse.Namespace) -> int:
         if options.save_tree and options.save_tree.is_dir():
             raise InputError(f"cannot write to {options.save_tree}: it is a folder, expected the name of a file")
         with writable(*folders):
-            drive(sampling, options, line)
+            drive(sampling, options, line, folder)
             line.enter_phase("writing")
             samples = write(sampling.record, options, folder)
     return report(sampling.record, samples, options, folder)
 
 
-def drive(sampling: cgs_jax.Run, options: argparse.Namespace, line: LiveLine) -> None:
-    """Runs to the end of the budget; the first Ctrl-C ends it early, a second one at once."""
+def drive(sampling: cgs_jax.Run, options: argparse.Namespace, line: LiveLine, folder: Path) -> None:
+    """Runs to the end of the budget; the first Ctrl-C ends it early, a second one at once.
+
+    What an earlier run left goes when sampling starts; from then on samples are written as they come.
+    """
 
     def stop(*_: object) -> None:
         sampling.stop()
@@ -269,26 +283,38 @@ def drive(sampling: cgs_jax.Run, options: argparse.Namespace, line: LiveLine) ->
 
     before = signal.signal(signal.SIGINT, stop)
     line.enter_phase("compiling")
+    appended = -math.inf
     try:
-        for event in sampling.events(options.time_budget, options.num_samples):
+        for event in sampling.events(options.time_budget, options.num_samples, options.coverage_gain):
             kind = type(event).__name__
             if kind == "Compiled" and line.phase == "compiling":
                 line.enter_phase("compiling", f"{len(sampling.record.programs)} programs ready")
             elif kind == "Started":
+                clear(folder)
                 line.enter_phase("sampling", "0 samples")
             elif line.phase == "sampling":
                 line.look(sampling.record)
+            if kind == "Found" and time.perf_counter() - appended > APPEND_SECONDS:
+                sampling.record.append(folder)
+                appended = time.perf_counter()
     finally:
         signal.signal(signal.SIGINT, before)
 
 
+def clear(folder: Path) -> None:
+    """Removes the files of an earlier run."""
+    from cgs_jax.samples import remove_parts
+
+    for name in WRITTEN:
+        (folder / name).unlink(missing_ok=True)
+    remove_parts(folder)
+
+
 def write(record: Recorder, options: argparse.Namespace, folder: Path) -> SampleSet:
-    """Writes all files, in place of those of an earlier run; returns the samples that were kept."""
+    """Writes all files; returns the samples that were kept."""
     samples = record.samples()
     if options.diverse is not None:
         samples = samples.select(samples.diverse(options.diverse))
-    for name in WRITTEN:
-        (folder / name).unlink(missing_ok=True)
     try:
         record.save(folder, samples)
         if options.save_tree:

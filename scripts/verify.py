@@ -9,6 +9,7 @@ none), 1 when one fails, 2 for bad input.
 from __future__ import annotations
 
 import argparse
+import glob
 import json
 import os
 import sys
@@ -54,9 +55,15 @@ class BadInput(Exception):
 
 
 def read(path: str) -> dict:
-    """All arrays of the file, checked for keys, types and shapes."""
+    """All arrays of the file, checked for keys, types and shapes.
+
+    A folder stands for its samples.npz or, where a run was killed before it wrote that, for the parts that it had written.
+    """
     if os.path.isdir(path):
+        parts = sorted(glob.glob(os.path.join(glob.escape(path), "samples.parts", "[0-9]*.npz")))
         path = os.path.join(path, "samples.npz")
+        if parts and not os.path.exists(path):
+            return joined([read(part) for part in parts])
     if not os.path.exists(path):
         raise BadInput(f"no such file: {path}")
     try:
@@ -99,6 +106,16 @@ def read(path: str) -> dict:
     if not np.isin(data["sequence"], np.arange(sequences)).all():
         raise BadInput(f"sequence holds a value that is no index into the {sequences} sequences")
     return data
+
+
+def joined(parts: list[dict]) -> dict:
+    """The samples of several files of one run in one; their `sequence` loses its meaning, which nothing here asks for."""
+    first = parts[0]
+    rows = ["qpos", "sequence", "elapsed", "violation", *(f"x_{name}" for name in first["variables"])]
+    for part in parts[1:]:
+        if any(str(part[key]) != str(first[key]) for key in ("mjcf", "variables", "attachments", "placements", "goals")):
+            raise BadInput("the parts are not of one run: remove those of the other")
+    return first | {key: np.concatenate([part[key] for part in parts]) for key in rows}
 
 
 def require_shape(key: str, array: np.ndarray, expected: tuple) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from cgs_jax.coverage import (
     Cell,
+    CoverageGain,
     bootstrap_interval,
     cell_indices,
     cover_radius,
@@ -189,6 +190,22 @@ def test_limit_share():
     assert limit_share(q, np.array([-1, -2.0]), np.array([1, 2.0]), 1e-3) == 0.5
     assert limit_share(q, np.array([-np.inf] * 2), np.array([np.inf] * 2), 1e-3) == 0.0
     assert limit_share(np.zeros((0, 2)), np.zeros(2), np.ones(2), 1e-3) == 0.0
+
+
+def test_coverage_gain_counts_the_first_in_each_cell_over_the_latest_samples():
+    gain = CoverageGain({"q": "configuration", "p": "pose"}, Cell(), window=4)
+    here, far = np.array([0, 0, 0, 1, 0, 0, 0.0]), np.array([9, 0, 0, 1, 0, 0, 0.0])
+    assert gain.share == 1.0
+    gain.add({"q": np.array([[0.1], [0.2], [3.1]]), "p": np.stack([here, here, far])})
+    assert gain.share == 3 / 4  # three samples: (new, old, new) after one that has not been drawn
+    gain.add({"q": np.array([[0.3], [3.2]]), "p": np.stack([far, here])})
+    assert gain.share == 1 / 4
+    gain.add({"q": np.zeros((0, 1)), "p": np.zeros((0, 7))})
+    assert gain.share == 1 / 4
+    gain.add({"q": np.full((4, 1), 0.2), "p": np.tile(here, (4, 1))})
+    assert gain.share == 0.0
+    gain.add({"q": np.full((1, 1), 0.2), "p": here[None] + [5, 0, 0, 0, 0, 0, 0]})
+    assert gain.share == 1 / 4  # of the variable that gains most
 
 
 def test_duplicate_share():

@@ -59,7 +59,7 @@ MAY_IMPORT = {
     # the porch
     "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
     "api": {
-        "errors", "augmented_lagrangian", "operators", "poses", "problems", "record", "sampler", "samples",
+        "errors", "augmented_lagrangian", "coverage", "operators", "poses", "problems", "record", "sampler", "samples",
         "transitions", "uct",
     },
 }  # fmt: skip

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from cgs_jax import render
+from cgs_jax.coverage import Cell, cell_indices
 from cgs_jax.errors import InputError
 from cgs_jax.samples import SampleSet
 
@@ -216,6 +217,52 @@ def test_a_live_line_and_ctrl_c_keeps_what_was_found(tmp_path):
     assert json.loads((out / "run.json").read_text())["ended_by"] == "interrupt"
 
 
+def test_a_killed_run_leaves_what_it_had_found(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "samples.npz").write_text("of an earlier run")
+    process = subprocess.Popen(
+        [sys.executable, SCRIPT, "--scene", "pick_place", "--time-budget", "100", "--quiet", "--out", out], cwd=ROOT
+    )
+    deadline = time.monotonic() + 100
+    while len(list(out.glob("samples.parts/0*.npz"))) < 2:
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    # What was being written when the process ended.
+    (out / "samples.parts" / ".000007.npz.unfinished").write_bytes(b"PK")
+    assert [path.name for path in out.iterdir()] == ["samples.parts"]
+    samples = verified(out)
+    assert len(samples) > 0 and samples.meta["ended_by"] is None and (np.diff(samples.elapsed) >= 0).all()
+    pieces = [SampleSet.load(path) for path in sorted((out / "samples.parts").glob("0*.npz"))]
+    np.testing.assert_array_equal(samples.qpos, np.concatenate([piece.qpos for piece in pieces]))
+    np.testing.assert_array_equal(SampleSet.load(out / "samples.npz").qpos, samples.qpos)
+    (out / "samples.parts" / "000000.npz").write_bytes(b"PK")
+    done = subprocess.run([sys.executable, VERIFY, out], capture_output=True, text=True)
+    assert done.returncode == 2 and "000000.npz is no readable" in done.stderr
+    with pytest.raises(InputError, match="000000.npz"):
+        SampleSet.load(out)
+
+    # The next run in this folder has nothing of it.
+    options = ["--num-samples", "5", "--time-budget", "60", "--quiet"]
+    assert command.main(["--scene", "pick_place", "--out", str(out), *options]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["run.json", "samples.npz", "tree.json"]
+
+
+def test_a_run_ends_where_samples_show_little_new(tmp_path):
+    options = ["--time-budget", "60", "--coverage-gain", "0.5", "--deterministic", "--method", "expert2", "--quiet"]
+    assert command.main(["--scene", "pick_place", "--out", str(tmp_path), *options]) == 0
+    samples = SampleSet.load(tmp_path)
+    assert samples.meta["ended_by"] == "coverage" and samples.meta["elapsed"] < 60
+    # Of the last 1000, by counting: fewer than half are in a cell of any variable that none was in before.
+    for name, values in samples.variables.items():
+        cells = [tuple(cell) for cell in cell_indices(values, Cell(), samples.kinds[name])]
+        seen = set(cells[:-1000])
+        first = [cell not in seen and not seen.add(cell) for cell in cells[-1000:]]
+        assert np.mean(first) < 0.5, name
+
+
 def test_ctrl_c_before_the_first_sample_ends_with_status_3(tmp_path):
     out = tmp_path / "out"
     task = copied(tmp_path / "scene", edit_task=goal_in_the_wall)
@@ -279,6 +326,8 @@ def refused(capsys, out, *arguments):
         ("--scene pick_place --batch-size -5", "--batch-size is -5"),
         ("--scene pick_place --batch-size many", "--batch-size is 'many', expected a whole number or auto"),
         ("--scene pick_place --num-samples 0", "--num-samples is 0, expected at least 1"),
+        ("--scene pick_place --coverage-gain 0", "--coverage-gain is 0, expected a share between 0 and 1"),
+        ("--scene pick_place --coverage-gain 1.5", "--coverage-gain is 1.5"),
         ("--scene pick_place --diverse 0", "--diverse is 0"),
         ("--scene pick_place --tries 0", "--tries is 0"),
         ("--scene pick_place --seed -1", "--seed is -1"),
