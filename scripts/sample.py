@@ -4,8 +4,8 @@
     python scripts/sample.py --scene handover --instance 3 --time-budget 30 --out runs/mine
     python scripts/sample.py --scene handover --method "p; t_a; t_b; q_a1; q_a2; q_b2; q_b1"
 
-Writes samples.npz, tree.json and run.json; while it runs, what it has found to samples.parts. Exit status: 0 with at least one sample (also after Ctrl-C), 3 with none (one
-line says which operator and constraint stopped it), 2 for bad input.
+Writes samples.npz, tree.json and run.json; while it runs, what it has found so far to samples.parts. Exit status: 0 with at
+least one sample (also after Ctrl-C), 3 with none (one line says which operator and constraint stopped it), 2 for bad input.
 """
 
 from __future__ import annotations
