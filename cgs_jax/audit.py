@@ -4,8 +4,10 @@ Nothing here is shared with the solver. Poses are recomputed by a batched float6
 `mujoco.MjModel`; contacts are decided by C MuJoCo. Calling C MuJoCo from Python costs about 10 us per configuration, so
 a configuration is first tried against a *proof* that it is free of contact: bounding spheres, then a separating
 direction for each pair of geoms that the spheres leave open. The proofs are lower bounds of the distance, so they can
-only err towards asking; what they leave open goes to `mujoco.mj_collision`, which alone says how deep a contact is.
-`scripts/verify.py` checks the same conditions again with C MuJoCo for everything.
+only err towards asking; what they leave open goes to `mujoco.mj_collision`, which says how deep a contact is. MuJoCo looks
+for a capsule's contacts near its ends and the box's edges and so has none for one that passes right through a thin box:
+of the pairs left open, those whose segment meets the box are found here. `scripts/verify.py` checks the same conditions
+again, with C MuJoCo for everything.
 
 Batched arrays have the batch last, so that every numpy call works on long contiguous rows: a rotation is (3, 3, B) with
 the frame's axes as columns, a position (3, B), both of the frame in the world.
@@ -634,10 +636,17 @@ class _Contacts:
         self.box = np.array([core.is_box for core in self.cores], dtype=bool)
         self.bound = np.array([core.bound for core in self.cores])
         self.reach = np.array([core.radius + 0.5 * _CLEARANCE for core in self.cores], dtype=np.float32)
+        kinds = np.array(model.geom_type)[order]
+        self.capsule_radius = np.where(
+            kinds == int(mujoco.mjtGeom.mjGEOM_CAPSULE), [core.radius for core in self.cores], 0.0
+        )
+        self.solid = kinds == int(mujoco.mjtGeom.mjGEOM_BOX)
         self.groups = self._group_by_link()
         pairs = np.sort(row_of[live_pairs(model)], axis=1)
         provable = np.array([core.provable for core in self.cores], dtype=bool)
         self.never_proved = bool(model.nflex) or not provable[pairs].all()
+        either = np.concatenate([pairs, pairs[:, ::-1]])
+        self.capsule_box = either[(self.capsule_radius[either[:, 0]] > 0.0) & self.solid[either[:, 1]]]
         self._spare: list[_Scratch] = []
         self.fixed_boxes: list[_FixedBox] = []
         self.partners: list[_Partners] = []
@@ -688,26 +697,34 @@ class _Contacts:
         return _Scratch(centre, edge, mujoco.MjData(self.model))
 
     def penetration(self, qpos: Floats, links: list[_Pose], scratch: _Scratch) -> Floats:
-        """Deepest penetration (B,) in m at qpos (nq, B), zero where nothing touches."""
-        depth = np.zeros(qpos.shape[1])
+        """Deepest penetration (B,) in m at qpos (nq, B), zero where nothing touches.
+
+        A capsule whose segment meets a box counts for its radius at least.
+        """
+        batch = qpos.shape[1]
+        depth = np.zeros(batch)
         model, data = self.model, scratch.data
-        worth_proving = qpos.shape[1] >= _WORTH_PROVING
-        for index in np.flatnonzero(self.unproved(links, scratch)) if worth_proving else range(qpos.shape[1]):
+        self._fill(links, scratch, batch)
+        if self.never_proved or batch < _WORTH_PROVING:
+            capsule, box, lane = self._near_boxes(scratch.centre[:, :, :batch])
+            asked = np.arange(batch)
+        else:
+            capsule, box, lane = self.unproved(scratch, batch)
+            asked = np.unique(lane)
+        for index in asked:
             data.qpos[:] = qpos[:, index]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
             if data.ncon:
                 depth[index] = max(0.0, -data.contact.dist.min())
+        pierced = self._pierced(capsule, box, lane, scratch)
+        np.maximum.at(depth, lane[pierced], self.capsule_radius[capsule[pierced]])
         return depth
 
-    def unproved(self, links: list[_Pose], scratch: _Scratch) -> NDArray[np.bool_]:
-        """True (B,) where no proof was found that the configuration is free of contact."""
-        batch = links[0][1].shape[1]
-        open_ = np.full(batch, self.never_proved)
-        if self.never_proved:
-            return open_
-        self._fill(links, scratch, batch)
+    def unproved(self, scratch: _Scratch, batch: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs of rows, with the lane, for which no proof was found that they are apart; of two kinds, a box is second."""
         first, second, lane = self._near(scratch.centre[:, :, :batch])
+        left: list[tuple[NDArray[np.intp], ...]] = [(np.zeros(0, dtype=np.intp),) * 3]
         boxes = self.box[first].astype(np.int8) + self.box[second]
         for count in range(3):
             chosen = np.flatnonzero(boxes == count)
@@ -720,8 +737,9 @@ class _Contacts:
                 swap = self.box[a] & ~self.box[b]
                 a, b = np.where(swap, b, a), np.where(swap, a, b)
                 apart = self._boxes_apart(a, b, at_lane, scratch, edges=1 if count == 1 else 3)
-            open_[at_lane[~apart]] = True
-        return open_
+            left.append((a[~apart], b[~apart], at_lane[~apart]))
+        a, b, at_lane = (np.concatenate(parts) for parts in zip(*left, strict=True))
+        return a, b, at_lane
 
     def _fill(self, links: list[_Pose], scratch: _Scratch, batch: int) -> None:
         for link, of_geoms, of_edges, vectors in self.groups:
@@ -757,6 +775,37 @@ class _Contacts:
         if not first:
             return (np.zeros(0, dtype=np.intp),) * 3
         return np.concatenate(first), np.concatenate(second), np.concatenate(lanes)
+
+    def _near_boxes(self, centre: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of capsules and of boxes, with the lane, where bounding spheres touch."""
+        capsule, box = self.capsule_box.T
+        away = centre[:, capsule] - centre[:, box]
+        reach = _squared_reach(self.bound[capsule] + self.bound[box])
+        which, lane = np.nonzero(np.einsum("ijb,ijb->jb", away, away) < reach)
+        return capsule[which], box[which], lane
+
+    def _pierced(
+        self, a: NDArray[np.intp], b: NDArray[np.intp], lane: NDArray[np.intp], scratch: _Scratch
+    ) -> NDArray[np.intp]:
+        """Positions in these pairs of the capsules, first, whose segment c + s u, s in [-1, 1], meets a box, second.
+
+        Between the box's two planes across each of its half edges e, |(c + s u) . e| <= e . e, s is in an interval; the
+        segment meets the box when the three and [-1, 1] have a point in common. Single precision is enough: a segment that
+        misses the box by its rounding is nearly a radius deep.
+        """
+        chosen = np.flatnonzero((self.capsule_radius[a] > 0.0) & self.solid[b])
+        a, b, lane = a[chosen], b[chosen], lane[chosen]
+        away = _gather(scratch.centre, a, lane) - _gather(scratch.centre, b, lane)
+        u = _gather(scratch.edge, self.first_edge[a], lane)
+        first, last = np.full(len(a), -1.0, dtype=np.float32), np.ones(len(a), dtype=np.float32)
+        for j in range(3):
+            edge = _gather(scratch.edge, self.first_edge[b] + j, lane)
+            along, squared = _dot(u, edge), _dot(edge, edge)
+            along = np.where(np.abs(along) < _TINY, _TINY, along)
+            middle, half = -_dot(away, edge) / along, squared / np.abs(along)
+            np.maximum(first, middle - half, out=first)
+            np.minimum(last, middle + half, out=last)
+        return chosen[first <= last]
 
     def _segments_apart(
         self, a: NDArray[np.intp], b: NDArray[np.intp], lane: NDArray[np.intp], scratch: _Scratch

@@ -174,6 +174,38 @@ def outside(position: np.ndarray, low: list, high: list) -> np.ndarray:
     return np.maximum(np.maximum(np.array(low) - position, position - np.array(high)).max(-1), 0.0)
 
 
+def segments_meet_box(centre: np.ndarray, axis: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Whether (P,) the segments (P, 3) from centre - axis to centre + axis, given in the box's frame, meet the box."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.sort(np.stack([(-half - centre) / axis, (half - centre) / axis]), axis=0)
+    # Parallel to two faces: between them all along, or nowhere.
+    always = np.array([-np.inf, np.inf])[:, None, None]
+    ends = np.where(axis == 0.0, np.where(np.abs(centre) <= half, always, -always), ends)
+    return np.maximum(ends[0].max(axis=1), -1.0) <= np.minimum(ends[1].min(axis=1), 1.0)
+
+
+def capsule_box_pairs(model: mujoco.MjModel) -> np.ndarray:
+    """Geoms (P, 2) that MuJoCo's filters let collide, a capsule and a box each."""
+    excluded = {(int(both) >> 16, int(both) & 0xFFFF) for both in model.exclude_signature}
+    explicit = {frozenset(map(int, both)) for both in zip(model.pair_geom1, model.pair_geom2, strict=True)}
+    filter_parent = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+
+    def collide(a: int, b: int) -> bool:
+        if frozenset((a, b)) in explicit:
+            return True
+        bodies = sorted(int(model.geom_bodyid[geom]) for geom in (a, b))
+        # Bodies welded together count as one; so do all that are fixed in the world, whose parents do not matter.
+        one, other = (int(model.body_weldid[body]) for body in bodies)
+        parents = [int(model.body_weldid[model.body_parentid[weld]]) for weld in (one, other)]
+        related = filter_parent and one and other and (one == parents[1] or other == parents[0])
+        bits = model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
+        return bool(bits) and one != other and not related and tuple(bodies) not in excluded
+
+    kinds = (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+    capsules, boxes = (np.flatnonzero(model.geom_type == int(kind)).tolist() for kind in kinds)
+    return np.array([(a, b) for a in capsules for b in boxes if collide(a, b)], dtype=int).reshape(-1, 2)
+
+
 class Scene:
     """Poses of named frames, and contacts, by C MuJoCo."""
 
@@ -189,6 +221,7 @@ class Scene:
         for flag in (mujoco.mjtDisableBit.mjDSBL_CONTACT, mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
             model.opt.disableflags &= ~int(flag)
         self.data = mujoco.MjData(model)
+        self.capsule_box = capsule_box_pairs(model)
 
     def find(self, name: str, kinds: str) -> tuple[str, int]:
         """Where a name is: kinds "body site" prefers a body."""
@@ -199,7 +232,11 @@ class Scene:
         raise BadInput(f"mjcf has no {kinds.replace(' ', ' or ')} named {name!r}")
 
     def evaluate(self, qpos: np.ndarray, wanted: list[tuple[str, int]]) -> tuple[dict, np.ndarray]:
-        """Poses ((B, 3), (B, 4)) of the wanted frames and the deepest penetration (B,) at qpos (B, nq)."""
+        """Poses ((B, 3), (B, 4)) of the wanted frames and the deepest penetration (B,) at qpos (B, nq).
+
+        MuJoCo has no contact for a capsule that passes right through a box with both ends far outside: one whose axis meets a
+        box counts for its radius at least.
+        """
         model, data = self.model, self.data
         bodies = [index for kind, index in wanted if kind == "body"]
         sites = [index for kind, index in wanted if kind == "site"]
@@ -207,6 +244,8 @@ class Scene:
         quat = np.empty((len(qpos), len(wanted), 4))
         penetration = np.zeros(len(qpos))
         site_quat = np.empty(4)
+        geom_position = np.empty((len(qpos), model.ngeom, 3))
+        geom_frame = np.empty((len(qpos), model.ngeom, 9))
         for row, configuration in enumerate(qpos):
             data.qpos[:] = configuration
             mujoco.mj_kinematics(model, data)
@@ -217,6 +256,16 @@ class Scene:
                 position[row, column], quat[row, column] = data.site_xpos[site], site_quat
             if data.ncon:
                 penetration[row] = max(0.0, -data.contact.dist.min())
+            geom_position[row], geom_frame[row] = data.geom_xpos, data.geom_xmat
+        for capsule, box in self.capsule_box:
+            away = geom_position[:, capsule] - geom_position[:, box]
+            near = np.flatnonzero(np.linalg.norm(away, axis=1) < model.geom_rbound[capsule] + model.geom_rbound[box])
+            radius, length = model.geom_size[capsule, :2]
+            frame = geom_frame[near, box].reshape(-1, 3, 3)
+            axis = length * geom_frame[near, capsule, 2::3]
+            centre, axis = (np.einsum("pji,pj->pi", frame, vector) for vector in (away[near], axis))
+            pierced = near[segments_meet_box(centre, axis, model.geom_size[box])]
+            penetration[pierced] = np.maximum(penetration[pierced], radius)
         ordered = [("body", index) for index in bodies] + [("site", index) for index in sites]
         return {frame: (position[:, i], quat[:, i]) for i, frame in enumerate(ordered)}, penetration
 
