@@ -183,6 +183,11 @@ def test_ci_runs_the_readmes_test_line():
     assert line in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
+def test_the_api_page_tells_every_public_name():
+    told = re.findall(r"\*\*`(\w+)", (ROOT / "docs" / "api.md").read_text())
+    assert sorted(set(told)) == cgs_jax.__all__
+
+
 def normalised(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
