@@ -25,8 +25,8 @@ PAGES = [
 
 # What is appended to a command; the last one of an option counts.
 SHORTENED = {
-    "scripts/sample.py": ["--num-samples", "10", "--time-budget", "60", "--quiet"],
-    "scripts/show.py": ["--samples", "diverse:1"],
+    "scripts/sample.py": ["--num-samples", "2", "--time-budget", "60", "--quiet"],
+    "scripts/show.py": ["--samples", "diverse:1", "--size", "160x120", "--hold-only"],
     "scripts/verify.py": [],
 }
 
@@ -52,7 +52,7 @@ REWRITTEN = {
     "api.md": {"coverage_gain=0.5": "coverage_gain=0.9"},
 }
 
-# From where a page imports JAX, for functions of its own, JAX keeps what it compiles: the package's cache has its programs only.
+# From where a page imports JAX, for functions of its own, JAX keeps what it compiles; the package's cache has its programs.
 CACHED_JIT = """
 import jax
 from jax.experimental.compilation_cache import compilation_cache
@@ -80,6 +80,8 @@ def commands(path):
 def load_script(path):
     spec = importlib.util.spec_from_file_location(f"documented_{Path(path).stem}", ROOT / path)
     module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up.
+    sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
