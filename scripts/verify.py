@@ -60,11 +60,12 @@ def read(path: str) -> dict:
     A folder stands for its samples.npz or, where a run was killed before it wrote that, for the parts that it had written.
     """
     if os.path.isdir(path):
-        parts = sorted(glob.glob(os.path.join(glob.escape(path), "samples.parts", "[0-9]*.npz")))
         path = os.path.join(path, "samples.npz")
-        if parts and not os.path.exists(path):
-            return joined([read(part) for part in parts])
     if not os.path.exists(path):
+        folder, name = os.path.split(path)
+        parts = sorted(glob.glob(os.path.join(glob.escape(folder), "samples.parts", "[0-9]*.npz")))
+        if parts and name == "samples.npz":
+            return joined([read(part) for part in parts])
         raise BadInput(f"no such file: {path}")
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -96,6 +96,18 @@ def test_there_is_no_block_that_nobody_runs():
             assert not re.search(r"^(python|pip|import) ", block, flags=re.M), f"{path}: a block that should be sh or python"
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_within_the_repository_lead_somewhere(path):
+    for target in re.findall(r"\]\(([^)#]+)", path.read_text(encoding="utf-8")):
+        known = target.startswith("https://") or Path(target).name in TESTED_APART
+        assert known or (path.parent / target).exists(), target
+
+
+def test_pictures_are_small():
+    for path in (ROOT / "docs" / "images").iterdir():
+        assert path.stat().st_size < {".png": 150_000, ".gif": 800_000}[path.suffix], path.name
+
+
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
     """A folder from which the commands find what they name."""
