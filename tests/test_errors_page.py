@@ -100,6 +100,7 @@ def calls(folder):
     yield lambda: cgs_jax.operator(at, given=(), new=("t",))(None, {}, at.params)
     tree = api.make_chooser(problem("handover")).as_json()
     yield lambda: cgs_jax.make_chooser(at, "tree-warm", prior=[tree])
+    yield lambda: cgs_jax.make_chooser(at, "tree-warm", prior=[{"schema": "older"}])
     one = {"sequences": ("q",), "sequence": [0], "elapsed": [0.0], "violation": [[]]}
     samples = SampleSet("<mujoco/>", {"q": np.zeros((1, 2))}, ("pick",), np.zeros((1, 1, 2)), **one)
     yield lambda: samples["t"]
