@@ -95,7 +95,7 @@ def test_the_files_beside_tell_the_run(finished):
     assert told["samples"] == 20 and told["rate"] > 0 and told["startup_seconds"] > 0
     assert told["diagnosis"] is None and told["best_sequences"]
     assert all(0 <= share <= 1 for shares in told["spread"].values() for share in shares.values())
-    assert json.loads((out / "tree.json").read_text())["schema"] == "cgs_jax.tree/1"
+    assert json.loads((out / "tree.json").read_text())["schema"] == "cgs_jax.tree/2"
     assert sorted(path.name for path in out.iterdir()) == ["run.json", "samples.npz", "tree.json"]
 
 
