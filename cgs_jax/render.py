@@ -504,6 +504,23 @@ def ghost_overlay(
     return _with_caption(picture, parts)
 
 
+def recoloured(
+    model: mujoco.MjModel, qpos: Floats, views: Mapping[str, Floats], size: Size, camera: Camera | None = None
+) -> Picture:
+    """One configuration (nq,) several times side by side, from one camera: caption to RGBA (ngeom, 4) of the geoms in 0..1.
+
+    Returns (H, W, 3). Raises InputError for a size out of range or without OpenGL.
+    """
+    size = _check_size(size)
+    camera = frame_camera(model, np.asarray(qpos)[None], size, camera)
+    pictures = []
+    with _painter(model, camera, size) as painter:
+        for caption, rgba in views.items():
+            model.geom_rgba[:] = rgba
+            pictures.append(_with_caption(painter.draw(qpos), [(caption, _INK)]))
+    return np.concatenate(pictures, axis=1)
+
+
 def _with_caption(picture: Picture, parts: Sequence[tuple[str, tuple[int, int, int]]], right: str = "") -> Picture:
     """The picture with one line of text on paper below it."""
     height, width = picture.shape[:2]
