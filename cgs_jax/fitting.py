@@ -145,7 +145,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class FittedRobot:
-    """A robot as a tree of links, parents first, with a tool frame: z along the approach, y the closing axis."""
+    """A robot as a tree of links, parents first, with a tool frame: z along the approach."""
 
     name: str
     links: tuple[Link, ...]
@@ -203,7 +203,6 @@ def read_robot(
     home: Mapping[str, float] | None = None,
     shapes: Mapping[str, Kind] | None = None,
     approach: str = "z",
-    closing: str = "y",
     movable: bool = True,
     skip_missing: bool = False,
 ) -> FittedRobot:
@@ -220,7 +219,7 @@ def read_robot(
     """
     model, notes = _compile(path, skip_missing)
     reader = _Reader(path.name, model, notes, dict(home or {}), dict(shapes or {}))
-    return reader.read(tool, _tool_axes(approach, closing), movable)
+    return reader.read(tool, _tool_axes(approach), movable)
 
 
 def element_names(path: Path, skip_missing: bool = False) -> set[str]:
@@ -248,13 +247,12 @@ def graft(arm: FittedRobot, gripper: FittedRobot) -> FittedRobot:
     )
 
 
-def _tool_axes(approach: str, closing: str) -> Floats:
-    for option, value in (("approach", approach), ("closing axis", closing)):
-        if value not in AXES:
-            raise InputError(f"{option} '{value}' is no axis of the tool, expected one of: {', '.join(AXES)}")
-    z, y = AXES[approach], AXES[closing]
-    if z @ y:
-        raise InputError(f"approach '{approach}' and closing axis '{closing}' must be perpendicular")
+def _tool_axes(approach: str) -> Floats:
+    """A rotation whose z is that axis; the identity for z."""
+    if approach not in AXES:
+        raise InputError(f"approach '{approach}' is no axis of the tool, expected one of: {', '.join(AXES)}")
+    z = AXES[approach]
+    y = AXES["y"] if not z @ AXES["y"] else AXES["x"]
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 

@@ -35,6 +35,8 @@ CLEARANCE = 0.001
 WIDEST = 0.12
 """Metres up to which a finger is looked for on each side of the tool."""
 
+QUARTER_TURN = Frame(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+
 
 @dataclasses.dataclass(frozen=True)
 class Overlap:
@@ -81,9 +83,16 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
     notes: list[str] = []
     near = robot.at_tool()
     gap = finger_gap(near)
+    if gap is None:
+        # The file may have the closing axis along x.
+        turned = dataclasses.replace(robot, tool=robot.tool.then(QUARTER_TURN))
+        gap = finger_gap(turned.at_tool())
+        if gap is not None:
+            robot, near = turned, turned.at_tool()
+            notes.append("fingers close along the tool's x axis: the tool is turned so that this is y")
     if grasp == "two_finger" and gap is None:
         raise InputError(
-            "no two fingers found on both sides of the tool along its closing axis; check the tool, its closing axis and the home "
+            "no two fingers found on both sides of the tool along its x or y axis; check the tool, its approach and the home "
             "values of the finger joints (open), or take the touch grasp"
         )
     chosen: Grasp = grasp or ("touch" if gap is None else "two_finger")

@@ -46,7 +46,6 @@ def parser() -> Parser:
     tool = parse.add_argument_group("where the tool is (SITE, or BODY:x,y,z in metres in the body's frame)")
     tool.add_argument("--tool", metavar="PLACE", help="between the finger tips, or at the end of the suction cup")
     tool.add_argument("--approach", default="z", metavar="AXIS", help="its axis that points at the object: x, -x, ... (z)")
-    tool.add_argument("--closing", default="y", metavar="AXIS", help="its axis along which fingers close (y)")
     tool.add_argument("--grasp", choices=("two_finger", "touch"), help="default: two_finger if there are fingers, else touch")
     tool.add_argument("--gripper", type=Path, metavar="FILE", help="MJCF or URDF of a gripper; --tool is then in its file")
     tool.add_argument("--flange", metavar="PLACE", help="with --gripper: where on the arm it is mounted")
@@ -90,11 +89,12 @@ def shape_kinds(texts: Sequence[str]) -> dict[str, fitting.Kind]:
 
 def read(options: argparse.Namespace) -> fitting.FittedRobot:
     home, shapes = home_values(options.home), shape_kinds(options.shape)
-    axes = {"approach": options.approach, "closing": options.closing}
     if options.gripper is None:
         if options.flange is not None:
             raise InputError("--flange says where a gripper is mounted; give the gripper's file with --gripper")
-        return fitting.read_robot(options.robot, options.tool, home, shapes, **axes, skip_missing=options.skip_missing)
+        return fitting.read_robot(
+            options.robot, options.tool, home, shapes, options.approach, skip_missing=options.skip_missing
+        )
     arm_names = fitting.element_names(options.robot, options.skip_missing)
     both = [
         {name: value for name, value in wishes.items() if (name in arm_names) == of_arm}
@@ -103,7 +103,13 @@ def read(options: argparse.Namespace) -> fitting.FittedRobot:
     ]
     arm = fitting.read_robot(options.robot, options.flange, both[0], both[1], skip_missing=options.skip_missing)
     gripper = fitting.read_robot(
-        options.gripper, options.tool, both[2], both[3], **axes, movable=False, skip_missing=options.skip_missing
+        options.gripper,
+        options.tool,
+        both[2],
+        both[3],
+        options.approach,
+        movable=False,
+        skip_missing=options.skip_missing,
     )
     return fitting.graft(arm, gripper)
 
