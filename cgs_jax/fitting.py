@@ -311,9 +311,11 @@ def _self_contained_urdf(
                 assets[key] = found.read_bytes()
                 mesh.set("filename", key)
     if missing and not skip_missing:
+        names = list(dict.fromkeys(missing))
+        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         raise InputError(
-            f"{path.name}: mesh files not found or not readable: {', '.join(dict.fromkeys(missing))}; put STL or OBJ files of these "
-            f"names beside the URDF or, for package://NAME/..., into a folder NAME beside or above it, or skip them (--skip-missing)"
+            f"{path.name}: {len(names)} mesh files not found or not readable: {shown}; put STL or OBJ files of these names "
+            f"beside the URDF or, for package://NAME/..., into a folder NAME beside or above it, or leave them out (--skip-missing)"
         )
     if missing:
         links = ", ".join(dict.fromkeys(bare))

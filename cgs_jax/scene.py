@@ -17,6 +17,7 @@ import io
 import math
 import re
 import tomllib
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -46,6 +47,9 @@ MOVING_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 EDITABLE = {"body": ("pos", "quat"), "geom": ("pos", "quat", "size"), "site": ("pos", "quat")}
 """What an instance may change in the MJCF, by kind of element."""
+
+IMPORT = "python scripts/import_robot.py"
+"""The command that makes a scene of primitives from a robot with other geoms."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -814,7 +818,8 @@ def load_scene(task: Task | str | Path, instance: int = 0) -> Scene:
     task: a task, or what `load_task` accepts. instance: 0-based.
 
     Raises InputError when the instance does not exist, the MJCF does not compile, an edit or the task names what the
-    MJCF lacks, an object or a floating base has no free joint, or a geom that can collide is no sphere, capsule or box.
+    MJCF lacks, an object or a floating base has no free joint, a geom that can collide is no sphere, capsule or box, or a
+    geom is a mesh from a file.
     """
     if not isinstance(task, Task):
         task = load_task(task)
@@ -827,6 +832,8 @@ def load_scene(task: Task | str | Path, instance: int = 0) -> Scene:
         dataclasses.replace(placement, **chosen.placements.get(placement.variable, {})) for placement in task.placements
     )
     task = dataclasses.replace(task, placements=replaced)
+    if task.model_path.suffix.lower() == ".urdf":
+        raise InputError(f"{task.model_path.name} is a URDF, expected an MJCF with objects and goals; make one with: {IMPORT}")
     try:
         spec = mujoco.MjSpec.from_file(str(task.model_path))
     except ValueError as error:
@@ -878,7 +885,8 @@ def _resolve(spec: mujoco.MjSpec, task: Task) -> tuple[mujoco.MjModel, str]:
             address = model.jnt_qposadr[joint]
             qpos[address : address + 7] = model.qpos0[address : address + 7]
         key.qpos = qpos
-        xml = spec.to_xml()
+        _refuse_mesh_files(spec, name)
+        xml = _without_unused_meshes(spec.to_xml())
     except ValueError as error:
         if isinstance(error, InputError):
             raise
@@ -887,6 +895,34 @@ def _resolve(spec: mujoco.MjSpec, task: Task) -> tuple[mujoco.MjModel, str]:
         return mujoco.MjModel.from_xml_string(xml), xml
     except ValueError as error:
         raise InputError(f"{name} is not self-contained, expected primitives only: {_one_line(error)}") from None
+
+
+def _refuse_mesh_files(spec: mujoco.MjSpec, where: str) -> None:
+    files = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file}
+    found = [
+        f"'{geom.name or geom.meshname}' of body '{geom.parent.name}'"
+        for geom in spec.geoms
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.meshname in files
+    ]
+    if found:
+        more = f" and {len(found) - 4} more" if len(found) > 5 else ""
+        shown = _listed(found if not more else found[:4])
+        raise InputError(
+            f"{where}: geoms are meshes from files: {shown}{more}; expected primitives: give each type=\"capsule\" or \"box\" "
+            f"beside its mesh, which MuJoCo then fits, or use: {IMPORT}"
+        )
+
+
+def _without_unused_meshes(xml: str) -> str:
+    """The MJCF text without meshes that no geom uses: MuJoCo writes a fitted geom as a primitive and keeps its mesh's file."""
+    root = ElementTree.fromstring(xml)
+    used = {element.get("mesh") for element in root.iter() if element.tag != "mesh"}
+    dropped = False
+    for asset in root.iter("asset"):
+        for mesh in [mesh for mesh in asset.findall("mesh") if mesh.get("name") not in used]:
+            asset.remove(mesh)
+            dropped = True
+    return ElementTree.tostring(root, encoding="unicode") + "\n" if dropped else xml
 
 
 def _names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
@@ -968,7 +1004,8 @@ def _check_model(model: mujoco.MjModel, task: Task) -> None:
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"number {geom}"
             raise InputError(
                 f"{where}: geom '{name}' of body '{body}' can collide and is of unsupported type "
-                f"'{kind.name.removeprefix('mjGEOM_').lower()}'; supported: {_listed(COLLISION_GEOMS.values())}"
+                f"'{kind.name.removeprefix('mjGEOM_').lower()}'; supported: {_listed(COLLISION_GEOMS.values())} "
+                f"({IMPORT} encloses others in one of these)"
             )
 
 

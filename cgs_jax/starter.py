@@ -35,6 +35,9 @@ CLEARANCE = 0.001
 WIDEST = 0.12
 """Metres up to which a finger is looked for on each side of the tool."""
 
+OURS = ("table", "box")
+"""Names of the scene's own bodies and joints."""
+
 QUARTER_TURN = Frame(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
 
@@ -81,6 +84,7 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
     Raises InputError when two fingers are asked for and none are found, or when random configurations do not reach the table.
     """
     notes: list[str] = []
+    robot = _without_our_names(robot)
     near = robot.at_tool()
     gap = finger_gap(near)
     if gap is None:
@@ -102,7 +106,7 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
         if front > 0:
             moved = robot.tool.then(Frame(np.eye(3), np.array([0.0, 0.0, front])))
             robot = dataclasses.replace(robot, tool=moved)
-            notes.append(f"the tool is moved {1000 * front:.0f} mm along the approach, to 1 mm in front of all primitives there")
+            notes.append(f"the tool is moved {1000 * front:.0f} mm along the approach, 1 mm in front of all primitives there")
         box = (0.03, 0.03, 0.04)
     else:
         assert gap is not None
@@ -112,7 +116,7 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
         chosen_width = next((i for i, depth in enumerate(depths) if depth >= 0.03), int(np.argmax(depths)))
         width, depth = widths[chosen_width], depths[chosen_width]
         box = (round(min(width, 0.04), 4), round(float(np.clip(depth - 0.005, 0.015, 0.025)), 4), 0.06)
-        notes.append(f"fingers are {2000 * gap:.0f} mm apart, {1000 * depth:.0f} mm deep for the box, {2000 * box[0]:.0f} mm wide")
+        notes.append(f"fingers: {2000 * gap:.0f} mm apart, {1000 * depth:.0f} mm deep for a box {2000 * box[0]:.0f} mm wide")
     table = base_height(robot)
     plain = robot_mjcf(robot, name, table)
     overlaps, free, busiest, reached = explore(robot, plain, table)
@@ -126,6 +130,15 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
     mjcf = robot_mjcf(robot, name, table, overlaps, box, (places[0], places[1]), chosen)
     task = _task_text(robot, name, chosen, box, places[1])
     return Starter(mjcf, task, chosen, box, overlaps, free, busiest, tuple(notes))
+
+
+def _without_our_names(robot: FittedRobot) -> FittedRobot:
+    """The robot with links and joints renamed where the scene around it needs the name."""
+    links = []
+    for link in robot.links:
+        joints = tuple(dataclasses.replace(j, name=f"robot_{j.name}") if j.name in OURS else j for j in link.joints)
+        links.append(dataclasses.replace(link, name=f"robot_{link.name}" if link.name in OURS else link.name, joints=joints))
+    return dataclasses.replace(robot, links=tuple(links))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -253,8 +266,8 @@ def _reachable(robot: FittedRobot, poses: Floats, table: float) -> tuple[Floats,
     chosen = poses[down] if down.sum() >= 20 else poses[low]
     if len(chosen) < 5:
         raise InputError(
-            f"only {len(chosen)} of {TRIES} random configurations bring the tool near the table without a collision; check the tool, "
-            "the joints' ranges and the picture of the fit"
+            f"only {len(chosen)} of {TRIES} random configurations bring the tool near the table without a collision; check the "
+            "tool, its approach, the joints' ranges and which geoms are fitted"
         )
     distances = np.linalg.norm(chosen[:, :2] - centre, axis=1)
     radius = float(np.quantile(distances, 0.6))
@@ -309,8 +322,8 @@ def robot_mjcf(
     visual = ElementTree.SubElement(root, "visual")
     ElementTree.SubElement(visual, "headlight", ambient=".4 .4 .4", diffuse=".6 .6 .6", specular=".1 .1 .1")
     asset = ElementTree.SubElement(root, "asset")
-    sky = {"type": "skybox", "builtin": "gradient", "rgb1": ".85 .90 .95", "rgb2": ".60 .68 .78", "width": "64", "height": "384"}
-    ElementTree.SubElement(asset, "texture", {"name": "sky"} | sky)
+    sky = {"name": "sky", "type": "skybox", "builtin": "gradient", "width": "64", "height": "384"}
+    ElementTree.SubElement(asset, "texture", sky | {"rgb1": ".85 .90 .95", "rgb2": ".60 .68 .78"})
     world = ElementTree.SubElement(root, "worldbody")
     if not looks:
         reach = 2.0
@@ -320,7 +333,7 @@ def robot_mjcf(
     elements: list[ElementTree.Element] = []
     for index, link in enumerate(robot.links):
         parent = world if link.parent < 0 else elements[link.parent]
-        element = ElementTree.SubElement(parent, "body", name=link.name, **_place(link.frame))
+        element = ElementTree.SubElement(parent, "body", {"name": link.name} | _place(link.frame))
         elements.append(element)
         for joint in link.joints:
             attributes = {"name": joint.name, "type": "slide"} if joint.slide else {"name": joint.name}
@@ -340,7 +353,8 @@ def robot_mjcf(
             # MuJoCo wants a mass where a joint moves, though nothing here depends on it.
             ElementTree.SubElement(element, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
         if index == robot.tool_link:
-            ElementTree.SubElement(element, "site", name="tool", size=".006", rgba=".9 .2 .2 1", **_place(robot.tool))
+            tool = {"name": "tool", "size": ".006", "rgba": ".9 .2 .2 1"}
+            ElementTree.SubElement(element, "site", tool | _place(robot.tool))
     if box is not None and places is not None:
         _add_box(world, box, places, grasp)
     if robot.excludes or overlaps:
@@ -422,13 +436,13 @@ def _task_text(
     if grasp == "two_finger":
         slide = round(box[2] - 0.015, 4)
         comment = (
-            "# The closing axis (y) of the tool is along the box's x axis: perpendicular to its y and z. The tool is centred in x\n"
-            "# and y and may slide along z; the turn about the closing axis is free."
+            "# The closing axis (y) of the tool is along the box's x axis: perpendicular to its y and z. The tool is centred in\n"
+            "# x and y and may slide along z; the turn about the closing axis is free."
         )
         rows = "[[[0, 1, 0], [0, 1, 0], 0.0], [[0, 1, 0], [0, 0, 1], 0.0]]"
         text = f'{{ kind = "two_finger", rows = {rows}, low = [0, 0, {-slide}], high = [0, 0, {slide}] }}'
     else:
-        comment = "# The tool's origin is on one of these sites of the box and its approach (z) points into it; the spin is free."
+        comment = "# The tool's origin is on one of these sites of the box, its approach (z) points into the box, the spin is free."
         sides = ", ".join(f'"box_{side}"' for side in ("top", "front", "back", "left", "right"))
         text = f'{{ kind = "touch", sites = [{sides}] }}'
     turned = ", ".join(f"{v:.4f}" for v in goal)

@@ -51,8 +51,10 @@ def parser() -> Parser:
     tool.add_argument("--flange", metavar="PLACE", help="with --gripper: where on the arm it is mounted")
 
     fit = parse.add_argument_group("the fit")
-    fit.add_argument("--home", action="append", default=[], metavar="JOINT=VALUE", help="home value of a joint (rad, m); repeat")
-    fit.add_argument("--shape", action="append", default=[], metavar="NAME=KIND", help="fit box, capsule or sphere to a body or geom")
+    fit.add_argument("--home", action="append", default=[], metavar="JOINT=VALUE", help="home value of a joint; may be repeated")
+    fit.add_argument(
+        "--shape", action="append", default=[], metavar="NAME=KIND", help="fit a box, capsule or sphere to that body or geom"
+    )
     fit.add_argument("--skip-missing", action="store_true", help="leave out geoms whose mesh files are missing (URDF)")
     return parse
 
@@ -95,21 +97,23 @@ def read(options: argparse.Namespace) -> fitting.FittedRobot:
         return fitting.read_robot(
             options.robot, options.tool, home, shapes, options.approach, skip_missing=options.skip_missing
         )
-    arm_names = fitting.element_names(options.robot, options.skip_missing)
-    both = [
-        {name: value for name, value in wishes.items() if (name in arm_names) == of_arm}
-        for of_arm in (True, False)
-        for wishes in (home, shapes)
-    ]
-    arm = fitting.read_robot(options.robot, options.flange, both[0], both[1], skip_missing=options.skip_missing)
+    skip = options.skip_missing
+    of_arm = fitting.element_names(options.robot, skip)
+    arm = fitting.read_robot(
+        options.robot,
+        options.flange,
+        {name: value for name, value in home.items() if name in of_arm},
+        {name: value for name, value in shapes.items() if name in of_arm},
+        skip_missing=skip,
+    )
     gripper = fitting.read_robot(
         options.gripper,
         options.tool,
-        both[2],
-        both[3],
+        {name: value for name, value in home.items() if name not in of_arm},
+        {name: value for name, value in shapes.items() if name not in of_arm},
         options.approach,
         movable=False,
-        skip_missing=options.skip_missing,
+        skip_missing=skip,
     )
     return fitting.graft(arm, gripper)
 

@@ -42,6 +42,8 @@ MAY_IMPORT = {
     "coverage": {"errors", "samples"},
     "render": {"errors", "samples"},
     "viewer": {"errors", "render", "samples"},
+    "fitting": {"errors"},
+    "starter": {"errors", "fitting", "render"},
     # the bridge
     "programs": set(),
     "problems": {"errors", "graph", "transitions", "scene"} | MATHEMATICS,
@@ -73,11 +75,13 @@ HOST = {
     "coverage": {"numpy", "scipy"},
     "render": {"numpy", "mujoco", "PIL"},
     "viewer": {"numpy", "mujoco", "viser", "glfw"},
+    "fitting": {"numpy", "mujoco", "scipy"},
+    "starter": {"numpy", "mujoco"},
     "record": {"numpy"},
 }
 
 # Modules that scripts may read names from, beside `cgs_jax` itself: the homes of the public names and what is loaded on demand.
-DOORS = {*cgs_jax._HOMES.values(), "coverage", "experiments", "render", "viewer", "record"}
+DOORS = {*cgs_jax._HOMES.values(), "coverage", "experiments", "fitting", "render", "starter", "viewer", "record"}
 
 # The benchmark also times the parts apart.
 MEASURES_PARTS = {"benchmark": {"augmented_lagrangian", "operators", "plans", "poses", "seeds", "transitions"}}
