@@ -315,7 +315,7 @@ def _self_contained_urdf(
         shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         raise InputError(
             f"{path.name}: {len(names)} mesh files not found or not readable: {shown}; put STL or OBJ files of these names "
-            f"beside the URDF or, for package://NAME/..., into a folder NAME beside or above it, or leave them out (--skip-missing)"
+            f"beside the URDF or, for package://NAME/..., into a folder NAME beside or above it, or --skip-missing"
         )
     if missing:
         links = ", ".join(dict.fromkeys(bare))

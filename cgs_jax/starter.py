@@ -436,13 +436,13 @@ def _task_text(
     if grasp == "two_finger":
         slide = round(box[2] - 0.015, 4)
         comment = (
-            "# The closing axis (y) of the tool is along the box's x axis: perpendicular to its y and z. The tool is centred in\n"
-            "# x and y and may slide along z; the turn about the closing axis is free."
+            "# The closing axis (y) of the tool is along the box's x axis: perpendicular to its y and z. The tool is\n"
+            "# centred in x and y and may slide along z; the turn about the closing axis is free."
         )
         rows = "[[[0, 1, 0], [0, 1, 0], 0.0], [[0, 1, 0], [0, 0, 1], 0.0]]"
         text = f'{{ kind = "two_finger", rows = {rows}, low = [0, 0, {-slide}], high = [0, 0, {slide}] }}'
     else:
-        comment = "# The tool's origin is on one of these sites of the box, its approach (z) points into the box, the spin is free."
+        comment = "# The tool's origin is on one of these sites of the box, its approach (z) points into it; the spin is free."
         sides = ", ".join(f'"box_{side}"' for side in ("top", "front", "back", "left", "right"))
         text = f'{{ kind = "touch", sites = [{sides}] }}'
     turned = ", ".join(f"{v:.4f}" for v in goal)

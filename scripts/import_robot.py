@@ -51,7 +51,7 @@ def parser() -> Parser:
     tool.add_argument("--flange", metavar="PLACE", help="with --gripper: where on the arm it is mounted")
 
     fit = parse.add_argument_group("the fit")
-    fit.add_argument("--home", action="append", default=[], metavar="JOINT=VALUE", help="home value of a joint; may be repeated")
+    fit.add_argument("--home", action="append", default=[], metavar="JOINT=VALUE", help="home value of a joint; repeatable")
     fit.add_argument(
         "--shape", action="append", default=[], metavar="NAME=KIND", help="fit a box, capsule or sphere to that body or geom"
     )
