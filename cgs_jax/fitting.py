@@ -84,7 +84,7 @@ class Primitive:
     source: str
     """What it stands for: the geom's name and type in the robot's file."""
     excess: float | None
-    """Its volume over that of the convex hull of what it stands for; None where it is the very same primitive."""
+    """Its volume over that of the convex hull of what it stands for (inf: flat); None where it is the very same primitive."""
 
     def contains(self, points: Floats, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which points (P, 3) in the link's frame lie inside, or at most `margin` metres outside."""
@@ -525,8 +525,8 @@ class _Reader:
         return tuple(self._primitive(g) for g in solid), tuple(self._look(g) for g in shown)
 
     def _vertices(self, geom: int) -> Floats:
-        mesh = model_mesh = int(self.model.geom_dataid[geom])
-        start = int(self.model.mesh_vertadr[model_mesh])
+        mesh = int(self.model.geom_dataid[geom])
+        start = int(self.model.mesh_vertadr[mesh])
         return np.array(self.model.mesh_vert[start : start + int(self.model.mesh_vertnum[mesh])], dtype=float)
 
     def _rgba(self, geom: int) -> tuple[float, float, float, float]:
@@ -568,7 +568,7 @@ class _Reader:
         else:
             points, volume = self._solid(geom, kind, size, source)
             shape, numbers, place = enclose(points, wish)
-            excess = _volume(shape, numbers) / volume if volume > 0 else None
+            excess = _volume(shape, numbers) / volume if volume > 0 else math.inf
         return Primitive(shape, numbers, self._frame(geom).then(place), self._rgba(geom), source, excess)
 
     def _solid(self, geom: int, kind: mujoco.mjtGeom, size: Floats, source: str) -> tuple[Floats, float]:

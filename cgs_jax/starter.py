@@ -199,7 +199,10 @@ def explore(
     Returns the pairs to exclude, the share of configurations without a collision of all other pairs, those of the other pairs
     that overlap most often, and the free ones' tool poses (M, 4): position and z component of the approach.
     """
-    model = mujoco.MjModel.from_xml_string(mjcf)
+    try:
+        model = mujoco.MjModel.from_xml_string(mjcf)
+    except ValueError as error:
+        raise InputError(f"the robot's links give no model: {' '.join(str(error).split())}") from None
     data = mujoco.MjData(model)
     names = [model.body(i).name for i in range(model.nbody)]
 

@@ -20,7 +20,7 @@ from typing import NoReturn
 
 from cgs_jax import fitting, starter
 from cgs_jax.errors import InputError
-from cgs_jax.render import save_png
+from cgs_jax.render import Picture, save_png
 from cgs_jax.scene import load_scene
 
 
@@ -118,6 +118,13 @@ def read(options: argparse.Namespace) -> fitting.FittedRobot:
     return fitting.graft(arm, gripper)
 
 
+def draw(robot: fitting.FittedRobot) -> Picture:
+    try:
+        return starter.fit_picture(robot)
+    except InputError as error:
+        raise InputError(f"{error}; or do without the picture: --no-picture") from None
+
+
 def tell(robot: fitting.FittedRobot, start: starter.Starter) -> None:
     print(f"{robot.name}: {len(robot.joints)} joints, {sum(len(link.primitives) for link in robot.links)} primitives")
     for note in (*robot.notes, *start.notes):
@@ -155,7 +162,7 @@ def write(options: argparse.Namespace) -> None:
             (folder / f"{name}.toml").write_text(start.task, encoding="utf-8")
             load_scene(folder / f"{name}.toml")
             if not options.no_picture:
-                save_png(folder / f"{name}_fit.png", starter.fit_picture(robot))
+                save_png(folder / f"{name}_fit.png", draw(robot))
             out.mkdir(parents=True, exist_ok=True)
             for file in files:
                 shutil.copyfile(folder / file, out / file)

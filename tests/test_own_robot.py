@@ -168,16 +168,17 @@ def held(model, data, body, points):
 
 BRICK = "v 0 0 0\nv .3 0 0\nv 0 .1 0\nv 0 0 .06\nv .3 .1 0\nv .3 0 .06\nv 0 .1 .06\nv .3 .1 .06\n" + "".join(
     f"f {a} {b} {c}\n" for a, b, c in
-    ((1, 3, 2), (2, 3, 5), (4, 6, 7), (6, 8, 7), (1, 2, 4), (2, 6, 4), (3, 7, 5), (5, 7, 8), (1, 4, 3), (3, 4, 7), (2, 5, 6), (5, 8, 6))
+    ((1, 3, 2), (2, 3, 5), (4, 6, 7), (6, 8, 7), (1, 2, 4), (2, 6, 4), (3, 7, 5), (5, 7, 8), (1, 4, 3), (3, 4, 7), (2, 5, 6),
+     (5, 8, 6))
 )  # fmt: skip
 
 
 def arm_of(geom, asset="", joint='range="-1 1"'):
-    """A one-joint arm with a 2 kg base, as an MJCF text."""
+    """An arm of one joint, as an MJCF text."""
     return (
         f"<mujoco model='toy'><compiler angle='radian'/><asset>{asset}</asset><worldbody><body name='base'>"
-        f"<geom name='foot' type='box' size='.1 .1 .05'/><body name='link' pos='0 0 .3'><joint name='turn' axis='0 0 1' {joint}/>"
-        f"{geom}<site name='tool' pos='.4 0 0'/></body></body></worldbody></mujoco>"
+        f"<geom name='foot' type='box' size='.1 .1 .05'/><body name='link' pos='0 0 .3'>"
+        f"<joint name='turn' axis='0 0 1' {joint}/>{geom}<site name='tool' pos='.4 0 0'/></body></body></worldbody></mujoco>"
     )
 
 
@@ -248,14 +249,15 @@ def test_a_body_without_collision_geoms_is_not_forgotten(tmp_path):
 
 
 def urdf(mesh, joint_type="continuous", link_mesh=True):
-    origin = '<origin xyz="0 0 0.3"/>'
+    turn = '<parent link="base"/><child link="arm"/><origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>'
+    end = '<parent link="arm"/><child link="tip"/><origin xyz="0.4 0 0"/>'
     shape = f'<geometry><mesh filename="{mesh}"/></geometry>' if link_mesh else '<geometry><sphere radius="0.05"/></geometry>'
     limit = '<limit lower="0.2" upper="1.0" effort="1" velocity="1"/>' if joint_type == "revolute" else ""
     return (
         '<robot name="toy"><link name="base"><collision><geometry><box size="0.2 0.2 0.1"/></geometry></collision></link>'
         f'<link name="arm"><visual>{shape}</visual><collision>{shape}</collision></link>'
-        f'<joint name="turn" type="{joint_type}"><parent link="base"/><child link="arm"/>{origin}<axis xyz="0 0 1"/>{limit}</joint>'
-        '<link name="tip"/><joint name="end" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0.4 0 0"/></joint>'
+        f'<joint name="turn" type="{joint_type}">{turn}{limit}</joint>'
+        f'<link name="tip"/><joint name="end" type="fixed">{end}</joint>'
         "</robot>"
     )
 
@@ -336,11 +338,11 @@ def planar(folder, name="arm.xml"):
     """An arm of two hinges and a slide that reaches a table, of cylinders, with a gripper of two boxes; its file."""
     (folder / name).write_text(
         "<mujoco model='crane'><compiler angle='radian'/><worldbody><geom type='plane' size='2 2 .1'/><body name='post'>"
-        "<geom type='cylinder' size='.06 .25' pos='0 0 .25'/><body name='upper' pos='0 0 .6'>"
+        "<geom type='cylinder' size='.06 .25' pos='0 0 .25'/><body name='upper' pos='0 0 .5'>"
         "<joint name='j1' axis='0 0 1' range='-2.5 2.5'/><geom type='cylinder' size='.04' fromto='0 0 0 .4 0 0'/>"
         "<body name='fore' pos='.4 0 .1'><joint name='j2' axis='0 0 1' range='-2.5 2.5'/>"
         "<geom type='cylinder' size='.04' fromto='0 0 0 .3 0 0'/><body name='box' pos='.3 0 0' quat='0 1 0 0'>"
-        "<joint name='lift' type='slide' axis='0 0 1' range='0 .62'/><geom type='box' size='.02 .05 .02' pos='0 0 .06'/>"
+        "<joint name='lift' type='slide' axis='0 0 1' range='0 .42'/><geom type='box' size='.02 .05 .02' pos='0 0 .06'/>"
         "<site name='pinch' pos='0 0 .13'/>"
         "<body name='left' pos='0 .01 .12'><joint name='finger' type='slide' axis='0 1 0' range='0 .03'/>"
         "<geom type='box' size='.01 .005 .03' pos='0 .005 0'/></body>"

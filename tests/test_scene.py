@@ -525,7 +525,7 @@ def test_a_geom_that_never_collides_may_be_of_any_type(edited):
 def test_a_task_is_found_by_name_file_and_folder(edited):
     path = edited("banana", "[[instances]]", "[[instances]]")
     assert scenes.load_task(path).name == scenes.load_task(path.parent).name == scenes.load_task("banana").name
-    assert scenes.available_scenes() == ("banana", "handover", "pick_place")
+    assert scenes.available_scenes() == ("banana", "handover", "pick_place", "stack")
 
 
 def test_a_partial_goal_leaves_the_object_in_the_hand(edited):
