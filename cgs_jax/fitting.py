@@ -27,8 +27,11 @@ from cgs_jax.errors import InputError
 
 Floats = NDArray[np.float64]
 Kind = Literal["sphere", "capsule", "box"]
+Wish = Literal["sphere", "capsule", "box", "halves"]
 
 KINDS: tuple[Kind, ...] = ("sphere", "capsule", "box")
+WISHES: tuple[Wish, ...] = (*KINDS, "halves")
+"""What can be asked for a geom: one primitive of a kind, or two primitives, one for each half of a mesh."""
 AXES = {f"{sign}{name}": (-1 if sign else 1) * np.eye(3)[i] for i, name in enumerate("xyz") for sign in ("", "-")}
 """Directions by name: x, -x, y, ..."""
 
@@ -201,7 +204,7 @@ def read_robot(
     path: Path,
     tool: str | None = None,
     home: Mapping[str, float] | None = None,
-    shapes: Mapping[str, Kind] | None = None,
+    shapes: Mapping[str, Wish] | None = None,
     approach: str = "z",
     movable: bool = True,
     skip_missing: bool = False,
@@ -345,7 +348,7 @@ def _mesh_file(urdf: Path, wanted: str) -> Path | None:
 
 class _Reader:
     def __init__(
-        self, file: str, model: mujoco.MjModel, notes: list[str], home: dict[str, float], shapes: dict[str, Kind]
+        self, file: str, model: mujoco.MjModel, notes: list[str], home: dict[str, float], shapes: dict[str, Wish]
     ) -> None:
         self.file, self.model, self.notes, self.shapes = file, model, notes, shapes
         self.body_names = self._unique(mujoco.mjtObj.mjOBJ_BODY, model.nbody, "link")
@@ -522,7 +525,7 @@ class _Reader:
             self.notes.append(f"body '{self.body_names[body]}' has no geom that can collide: its visual geoms are fitted")
             solid = geoms
         shown = [g for g in geoms if model.geom_group[g] < 3] or geoms
-        return tuple(self._primitive(g) for g in solid), tuple(self._look(g) for g in shown)
+        return tuple(p for g in solid for p in self._primitives(g)), tuple(self._look(g) for g in shown)
 
     def _vertices(self, geom: int) -> Floats:
         mesh = int(self.model.geom_dataid[geom])
@@ -538,18 +541,20 @@ class _Reader:
     def _frame(self, geom: int) -> Frame:
         return frame_of(self.model.geom_pos[geom], self.model.geom_quat[geom])
 
+    def _faces(self, geom: int) -> NDArray[np.int32]:
+        mesh = int(self.model.geom_dataid[geom])
+        start, count = int(self.model.mesh_faceadr[mesh]), int(self.model.mesh_facenum[mesh])
+        return np.array(self.model.mesh_face[start : start + count], dtype=np.int32)
+
     def _look(self, geom: int) -> Appearance:
         kind = mujoco.mjtGeom(int(self.model.geom_type[geom]))
         x, y, z = (float(value) for value in self.model.geom_size[geom])
         look = Appearance(self._frame(geom), self._rgba(geom), kind, (x, y, z))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             return look
-        mesh = int(self.model.geom_dataid[geom])
-        start, count = int(self.model.mesh_faceadr[mesh]), int(self.model.mesh_facenum[mesh])
-        faces = np.array(self.model.mesh_face[start : start + count], dtype=np.int32)
-        return dataclasses.replace(look, vertices=self._vertices(geom), faces=faces)
+        return dataclasses.replace(look, vertices=self._vertices(geom), faces=self._faces(geom))
 
-    def _primitive(self, geom: int) -> Primitive:
+    def _primitives(self, geom: int) -> list[Primitive]:
         kind = mujoco.mjtGeom(int(self.model.geom_type[geom]))
         body = self.body_names[self.model.geom_bodyid[geom]]
         mesh = int(self.model.geom_dataid[geom])
@@ -559,26 +564,32 @@ class _Reader:
         source = f"{body}: {self.geom_names[geom]} ({noun})" if self.geom_names[geom] else f"{body}: {noun}"
         wish = self.shapes.get(self.geom_names[geom]) or self.shapes.get(body)
         size = np.array(self.model.geom_size[geom])
-        excess: float | None = None
-        place = IDENTITY
-        shape: Kind
+        frame, rgba = self._frame(geom), self._rgba(geom)
         if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX) and not wish:
-            shape = next(k for k in KINDS if k == noun)
-            numbers = tuple(float(v) for v in size[: {"sphere": 1, "capsule": 2, "box": 3}[shape]])
+            same = next(k for k in KINDS if k == noun)
+            count = {"sphere": 1, "capsule": 2, "box": 3}[same]
+            return [Primitive(same, tuple(float(v) for v in size[:count]), frame, rgba, source, None)]
+        if wish == "halves":
+            if kind != mujoco.mjtGeom.mjGEOM_MESH:
+                raise InputError(f"{self.file}: {source} is no mesh, so it has no halves to fit; expected: {', '.join(KINDS)}")
+            parts = halves(self._vertices(geom), self._faces(geom))
         else:
-            points, volume = self._solid(geom, kind, size, source)
-            shape, numbers, place = enclose(points, wish)
-            excess = _volume(shape, numbers) / volume if volume > 0 else math.inf
-        return Primitive(shape, numbers, self._frame(geom).then(place), self._rgba(geom), source, excess)
-
-    def _solid(self, geom: int, kind: mujoco.mjtGeom, size: Floats, source: str) -> tuple[Floats, float]:
-        """Points (P, 3) in the geom's frame whose convex hull holds the geom, and the volume of its hull, m^3."""
-        if kind == mujoco.mjtGeom.mjGEOM_MESH:
-            points = self._vertices(geom)
+            parts = [self._solid(geom, kind, size, source)]
+        found = []
+        for number, points in enumerate(parts):
+            shape, numbers, place = snug(points) if wish == "halves" else enclose(points, wish)
             try:
-                return points, float(ConvexHull(points).volume)
+                excess = _volume(shape, numbers) / float(ConvexHull(points).volume)
             except (QhullError, ValueError):
-                return points, 0.0
+                excess = math.inf
+            name = f"{source}, half {number + 1}" if len(parts) > 1 else source
+            found.append(Primitive(shape, numbers, frame.then(place), rgba, name, excess))
+        return found
+
+    def _solid(self, geom: int, kind: mujoco.mjtGeom, size: Floats, source: str) -> Floats:
+        """Points (P, 3) in the geom's frame whose convex hull holds the geom."""
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            return self._vertices(geom)
         names = {
             mujoco.mjtGeom.mjGEOM_CYLINDER: (size[0], size[0], size[1]),
             mujoco.mjtGeom.mjGEOM_ELLIPSOID: (size[0], size[1], size[2]),
@@ -591,8 +602,7 @@ class _Reader:
                 f"{self.file}: {source} can collide and has no enclosing primitive; expected meshes, cylinders, ellipsoids or "
                 f"{', '.join(KINDS)}: replace it by one of these in the file or give it contype=\"0\" conaffinity=\"0\""
             )
-        points = _surface(kind, np.array(names[kind]))
-        return points, float(ConvexHull(points).volume)
+        return _surface(kind, np.array(names[kind]))
 
 
 def _surface(kind: mujoco.mjtGeom, half: Floats) -> Floats:
@@ -639,6 +649,40 @@ def enclose(points: Floats, wish: Kind | None = None) -> tuple[Kind, tuple[float
     capsule: tuple[Kind, tuple[float, ...], Frame] = ("capsule", size, Frame(rotation, centre + offset))
     roomy = _volume("capsule", size) > BOX_WORTH * _volume("box", box[1])
     return box if wish is None and roomy else capsule
+
+
+def halves(vertices: Floats, faces: NDArray[np.int32]) -> list[Floats]:
+    """A mesh cut in two by a plane across one of its axes, where the two primitives around its parts are smallest.
+
+    vertices: (V, 3), faces: (F, 3). Returns the points of both parts, the rim of the cut in both, so that the convex hulls of
+    the parts hold all of a closed mesh.
+    """
+    best: tuple[float, list[Floats]] = (math.inf, [vertices])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    edges = vertices[np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)]
+    for axis in range(3):
+        for share in (0.3, 0.4, 0.5, 0.6, 0.7):
+            cut = low[axis] + share * (high[axis] - low[axis])
+            start, end = edges[:, 0], edges[:, 1]
+            crossing = (start[:, axis] - cut) * (end[:, axis] - cut) < 0
+            start, end = start[crossing], end[crossing]
+            rim = start + (end - start) * ((cut - start[:, axis]) / (end - start)[:, axis])[:, None]
+            parts = [np.concatenate([vertices[side], rim]) for side in (vertices[:, axis] <= cut, vertices[:, axis] >= cut)]
+            if min(map(len, parts)) < 4:
+                continue
+            volume = sum(_volume(*snug(part)[:2]) for part in parts)
+            if volume < best[0]:
+                best = volume, parts
+    return best[1]
+
+
+def snug(points: Floats) -> tuple[Kind, tuple[float, ...], Frame]:
+    """Like `enclose`, in the points' own axes or in the directions in which they spread, whichever needs less volume."""
+    *_, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    rotation = axes.T * [1, 1, np.linalg.det(axes)]
+    kind, size, place = enclose(points @ rotation)
+    turned = kind, size, Frame(rotation, np.zeros(3)).then(place)
+    return min(enclose(points), turned, key=lambda found: _volume(*found[:2]))
 
 
 def _capsule(points: Floats, axis: int) -> tuple[float, float, float, int]:

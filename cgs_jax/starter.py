@@ -100,6 +100,8 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
             "values of the finger joints (open), or take the touch grasp"
         )
     chosen: Grasp = grasp or ("touch" if gap is None else "two_finger")
+    if gap is None and grasp is None:
+        notes.append("nothing on both sides of the tool: touch grasp (fingers that are closed at home are opened with --home)")
     if chosen == "touch":
         # Everything that is fixed to the tool must end behind it, or each touch would be a collision.
         front = max((p.reach(np.array([0.0, 0.0, 1.0])) for p in near), default=-1.0) + CLEARANCE

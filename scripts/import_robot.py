@@ -53,7 +53,7 @@ def parser() -> Parser:
     fit = parse.add_argument_group("the fit")
     fit.add_argument("--home", action="append", default=[], metavar="JOINT=VALUE", help="home value of a joint; repeatable")
     fit.add_argument(
-        "--shape", action="append", default=[], metavar="NAME=KIND", help="fit a box, capsule or sphere to that body or geom"
+        "--shape", action="append", default=[], metavar="NAME=SHAPE", help="box, capsule, sphere or halves for a body or geom"
     )
     fit.add_argument("--skip-missing", action="store_true", help="leave out geoms whose mesh files are missing (URDF)")
     return parse
@@ -79,18 +79,18 @@ def home_values(texts: Sequence[str]) -> dict[str, float]:
     return found
 
 
-def shape_kinds(texts: Sequence[str]) -> dict[str, fitting.Kind]:
-    found: dict[str, fitting.Kind] = {}
+def shape_wishes(texts: Sequence[str]) -> dict[str, fitting.Wish]:
+    found: dict[str, fitting.Wish] = {}
     for name, value in pairs("--shape", texts).items():
-        kind = next((kind for kind in fitting.KINDS if kind == value), None)
-        if kind is None:
-            raise InputError(f"--shape '{name}={value}' is no primitive, expected one of: {', '.join(fitting.KINDS)}")
-        found[name] = kind
+        wish = next((wish for wish in fitting.WISHES if wish == value), None)
+        if wish is None:
+            raise InputError(f"--shape '{name}={value}' is no shape, expected one of: {', '.join(fitting.WISHES)}")
+        found[name] = wish
     return found
 
 
 def read(options: argparse.Namespace) -> fitting.FittedRobot:
-    home, shapes = home_values(options.home), shape_kinds(options.shape)
+    home, shapes = home_values(options.home), shape_wishes(options.shape)
     if options.gripper is None:
         if options.flange is not None:
             raise InputError("--flange says where a gripper is mounted; give the gripper's file with --gripper")

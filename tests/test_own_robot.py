@@ -245,6 +245,28 @@ def test_a_body_without_collision_geoms_is_not_forgotten(tmp_path):
     assert primitive.excess == pytest.approx(1.0, abs=1e-4)
 
 
+def test_halves_hold_a_bent_mesh_with_less_room_than_one_primitive(tmp_path):
+    # An L of two bars, closed: its profile swept along z.
+    profile = np.array([(0, 0), (0.4, 0), (0.4, 0.06), (0.06, 0.06), (0.06, 0.3), (0, 0.3)])
+    vertices = np.concatenate([np.column_stack([profile, np.full(6, z)]) for z in (0.0, 0.06)])
+    caps = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+    faces = [(a, c, b) for a, b, c in caps] + [(a + 6, b + 6, c + 6) for a, b, c in caps]
+    for i in range(6):
+        j = (i + 1) % 6
+        faces += [(i, j, j + 6), (i, j + 6, i + 6)]
+    vertex, face = (" ".join(map(str, np.ravel(values))) for values in (vertices, faces))
+    asset = f"<mesh name='m' vertex='{vertex}' face='{face}'/>"
+    (one,) = toy(tmp_path, "<geom name='g' type='mesh' mesh='m'/>", asset)
+    two = toy(tmp_path, "<geom name='g' type='mesh' mesh='m'/>", asset, shapes={"g": "halves"})
+    assert len(two) == 2
+    # Points of the solid, not only its corners: each is in one of the two.
+    rng = np.random.default_rng(4)
+    solid = np.concatenate([rng.uniform(0, high, (400, 3)) for high in ((0.4, 0.06, 0.06), (0.06, 0.3, 0.06))])
+    assert (two[0].contains(solid, 1e-6) | two[1].contains(solid, 1e-6)).all()
+    room = rng.uniform(-0.1, 0.5, size=(20000, 3))
+    assert (two[0].contains(room) | two[1].contains(room)).sum() < 0.7 * one.contains(room).sum()
+
+
 # ------------------------------------------------------------------ URDF
 
 
@@ -316,7 +338,8 @@ SPHERE = "<geom type='sphere' size='.05'/>"
         (arm_of(SPHERE), ["--home", "turn=2"], "home value 2 of joint 'turn' is outside -1 to 1"),
         (arm_of(SPHERE), ["--home", "turn"], "expected NAME=VALUE"),
         (arm_of(SPHERE), ["--shape", "arm=box"], "no body or geom 'arm'.*bodies: base, link"),
-        (arm_of(SPHERE), ["--shape", "link=egg"], "no primitive, expected one of: sphere, capsule, box"),
+        (arm_of(SPHERE), ["--shape", "link=egg"], "no shape, expected one of: sphere, capsule, box, halves"),
+        (arm_of(SPHERE), ["--shape", "link=halves"], "is no mesh, so it has no halves"),
         (arm_of(SPHERE), ["--flange", "tool"], "--gripper"),
         (arm_of(SPHERE), ["--grasp", "two_finger"], "no two fingers found"),
         (arm_of(SPHERE, joint="type='slide'"), [], "slide joint 'turn' above the tool has no range"),
