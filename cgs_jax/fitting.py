@@ -525,6 +525,8 @@ class _Reader:
             self.notes.append(f"body '{self.body_names[body]}' has no geom that can collide: its visual geoms are fitted")
             solid = geoms
         shown = [g for g in geoms if model.geom_group[g] < 3] or geoms
+        # Files often have each link twice, once to be seen and once to collide.
+        shown = [g for g in shown if g not in solid] or shown
         return tuple(p for g in solid for p in self._primitives(g)), tuple(self._look(g) for g in shown)
 
     def _vertices(self, geom: int) -> Floats:
