@@ -45,7 +45,7 @@ def parser() -> Parser:
 
     tool = parse.add_argument_group("where the tool is (SITE, or BODY:x,y,z in metres in the body's frame)")
     tool.add_argument("--tool", metavar="PLACE", help="between the finger tips, or at the end of the suction cup")
-    tool.add_argument("--approach", default="z", metavar="AXIS", help="its axis that points at the object: x, -x, ... (z)")
+    tool.add_argument("--approach", default="z", metavar="AXIS", help="its axis that points at objects (z); also --approach=-x")
     tool.add_argument("--grasp", choices=("two_finger", "touch"), help="default: two_finger if there are fingers, else touch")
     tool.add_argument("--gripper", type=Path, metavar="FILE", help="MJCF or URDF of a gripper; --tool is then in its file")
     tool.add_argument("--flange", metavar="PLACE", help="with --gripper: where on the arm it is mounted")

@@ -164,6 +164,16 @@ def held(model, data, body, points):
     return False
 
 
+@pytest.mark.parametrize("axis", sorted(fitting.AXES))
+def test_the_approach_becomes_the_tools_z(axis, tmp_path):
+    (tmp_path / "arm.xml").write_text(arm_of("<geom type='sphere' size='.05'/>"))
+    tool = fitting.read_robot(tmp_path / "arm.xml", approach=axis).tool
+    wanted = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}[axis[-1]]
+    np.testing.assert_allclose(tool.rotation[:, 2], np.multiply(wanted, -1 if axis[0] == "-" else 1), atol=1e-12)
+    np.testing.assert_allclose(tool.rotation @ tool.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(tool.rotation) == pytest.approx(1) and tuple(tool.position) == (0.4, 0, 0)
+
+
 # ------------------------------------------------------------------ enclosing
 
 BRICK = "v 0 0 0\nv .3 0 0\nv 0 .1 0\nv 0 0 .06\nv .3 .1 0\nv .3 0 .06\nv 0 .1 .06\nv .3 .1 .06\n" + "".join(
@@ -392,7 +402,7 @@ def test_the_command_tells_what_it_decided_and_writes_three_files(capsys, tmp_pa
     np.testing.assert_allclose(scene.model.body("left").pos, (0, 0.04, 0.12), atol=1e-6)
     assert command.main(wanted) == 2
     assert "already holds crane.xml" in capsys.readouterr().err
-    assert command.main([*wanted, "--overwrite", "--no-picture", "--grasp", "touch"]) == 0
+    assert command.main([*wanted, "--overwrite", "--no-picture", "--grasp", "touch", "--approach=z"]) == 0
     task = tomllib.loads((tmp_path / "crane" / "crane.toml").read_text())
     assert task["holds"][0]["grasp"]["kind"] == "touch"
 
