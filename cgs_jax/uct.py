@@ -17,7 +17,10 @@ What differs from plain UCT, and why:
 
 The reward is the paper's lambda * r_t + (1 - lambda) * r_g with lambda = 1/(c + 1), divided by (1 - lambda): success
 minus time * price, price = 1/c. With c the cost per *finished sample* this is Dinkelbach's rule, whose maximum is the
-most samples per second. With c the cost per rollout time is priced too dear and what fails fast is preferred.
+most samples per second. The realised rate lags behind what was learned, and at too low a price of time what succeeds
+often seems better than what is quick: the price is the predicted rate of the best sequence once that has been run to
+the end (Dinkelbach's iteration on the model). With c the cost per rollout time is priced too dear and what fails fast
+is preferred.
 """
 
 from __future__ import annotations
@@ -68,6 +71,9 @@ are more transitions than could be tried first. Its bonus still grows without bo
 
 HOPE = 0.5
 """In the search success is taken for its mean plus this many standard deviations, by what is known of the history."""
+
+PRICE_STEPS = 2
+"""Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
 CURIOSITY = 0.1
 """First trials of operators come first, smallest first, up to this share of the device time."""
@@ -224,12 +230,12 @@ class _History:
     """How a component came about: the operator that completed it and the histories that it read.
 
     success, cost: expected, per condition. item_cost: expected device seconds per item of the component, with all that it
-    was made of. prefix: the sequence by which it was first made, None before.
+    was made of. prefixes: sequences by which it was made, none before.
     """
 
     __slots__ = (
-        "cost", "hopeful_cost", "hopeful_success", "item_cost", "made", "operator", "prefix", "reads", "statistics", "success",
-        "version",
+        "cost", "hopeful_cost", "hopeful_success", "item_cost", "made", "operator", "prefixes", "reads", "statistics",
+        "success", "version",
     )  # fmt: skip
 
     def __init__(self, operator: _Operator, reads: tuple[_History, ...], made: State) -> None:
@@ -237,7 +243,7 @@ class _History:
         self.reads = reads
         self.made = made
         self.statistics = Statistics()
-        self.prefix: Path | None = None
+        self.prefixes: list[Path] = []
         self.success = self.cost = self.item_cost = self.hopeful_success = self.hopeful_cost = 0.0
         self.version = -1
 
@@ -260,13 +266,14 @@ class _History:
 class _Edge:
     """A step out of a node, and the history that it makes there."""
 
-    __slots__ = ("history", "kept", "node", "quality", "reach", "step", "value")
+    __slots__ = ("history", "kept", "node", "quality", "reach", "recorded", "step", "value")
 
     def __init__(self, step: _Step, history: _History, kept: tuple[_History, ...]) -> None:
         self.step = step
         self.history = history
         self.kept = kept
         self.node: _Node | None = None
+        self.recorded = False
         self.value = 0.0  # of what lies behind
         self.quality = 0.0  # the paper's Q
         self.reach = 0.0  # probability to finish from before the step on
@@ -347,7 +354,7 @@ class _Records:
         history = lineage[-1].history
         if not history.operator.statistics.visits:
             self._total.first_trials += seconds
-        self._name(history, (*prefix, transition))
+        self._name(lineage[-1], (*prefix, transition))
         # A batch that hardly tells anything hardly counts as a visit.
         visits *= min(1.0, sum(attempts) / VISIT_TRIES)
         keep = self.discount**visits
@@ -413,7 +420,7 @@ class _Records:
 
     def _finished_paths(self) -> list[Path]:
         full = self.transitions.full
-        return [history.prefix for history in self._known if history.prefix[-1].target == full]
+        return [history.prefixes[0] for history in self._known if history.prefixes[0][-1].target == full]
 
     def _cheapest_paths(self, k: int) -> list[Path]:
         """Forward search that keeps in every state the k partial sequences of least production cost."""
@@ -523,6 +530,8 @@ class _Records:
         key = frozenset(components)
         node = self._nodes.get(key)
         if node is None:
+            ordered = self.transitions.graph.ordered
+            components = tuple(sorted(components, key=lambda history: ordered(history.made)))
             node = self._nodes[key] = _Node(state, components)
         return node
 
@@ -553,10 +562,13 @@ class _Records:
             node = self._behind(edges[-1])
         return edges
 
-    def _name(self, history: _History, prefix: Path) -> None:
-        if history.prefix is None:
-            history.prefix = prefix
-            self._known.append(history)
+    def _name(self, edge: _Edge, prefix: Path) -> None:
+        """Remembers by which sequence a history was made, one for each node where that happened."""
+        if not edge.recorded:
+            edge.recorded = True
+            if not edge.history.prefixes:
+                self._known.append(edge.history)
+            edge.history.prefixes.append(prefix)
 
     # Files
 
@@ -566,7 +578,7 @@ class _Records:
     def as_json(self) -> dict[str, Any]:
         """Everything that was learned, readable, ready for json.dump. Schema "cgs_jax.tree/2".
 
-        "sequences" has one entry per history, under the sequence by which it was first made.
+        "sequences" has one entry per history, under the sequence by which it was first made; "also": others that made it.
         """
         graph = self.transitions.graph
         return {
@@ -583,7 +595,8 @@ class _Records:
             ],
             "sequences": [
                 {
-                    "sequence": self.transitions.format(history.prefix),
+                    "sequence": self.transitions.format(history.prefixes[0]),
+                    "also": [self.transitions.format(prefix) for prefix in history.prefixes[1:]],
                     **_described(history.statistics),
                     **self._value_of(history),
                 }
@@ -602,6 +615,8 @@ class _Records:
         for entry in data["sequences"]:
             history = self._history_at(entry["sequence"])
             _add(history.statistics, _read_statistics(entry))
+            for text in entry["also"]:
+                self._history_at(text)
         for name, value in data["totals"].items():
             setattr(self._total, name, getattr(self._total, name) + value)
         self._predict_operators()
@@ -609,9 +624,9 @@ class _Records:
     def _history_at(self, text: str) -> _History:
         """The history that a partial sequence makes."""
         prefix = _read_prefix(self.transitions, text)
-        history = self._follow(prefix)[-1].history
-        self._name(history, prefix)
-        return history
+        edge = self._follow(prefix)[-1]
+        self._name(edge, prefix)
+        return edge.history
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         """Start from earlier instances of the same graph (paper, Section IV-C).
@@ -650,8 +665,9 @@ class _Records:
 class Tree(_Records):
     """UCT over sequences with a model-based backup.
 
-    c_uct: weight of the exploration bonus, on values normalised to [0, 1] among siblings. reward: "rate" (time costs
-    the discounted realised rate) or "rollout" (time costs one over the mean seconds per rollout).
+    c_uct: weight of the exploration bonus, on values normalised among siblings. reward: "rate" (time costs the
+    discounted realised rate, or the predicted rate of the sequence of greatest Q where that is more) or "rollout" (time
+    costs one over the mean seconds per rollout).
     equivalent_visits: an operator's visits after other histories count on an edge like up to so many visits of its own,
     so that not every child of every node is tried anew. retain: on failure the components which the failed transition
     does not touch are kept and combined again; without it the whole partial sample is dropped. discount: factor on old
@@ -666,7 +682,7 @@ class Tree(_Records):
     def __init__(
         self,
         transitions: Transitions,
-        c_uct: float = 0.04,
+        c_uct: float = 0.06,
         reward: Literal["rate", "rollout"] = "rate",
         retain: bool = True,
         equivalent_visits: float = 4.0,
@@ -686,6 +702,7 @@ class Tree(_Records):
         self.equivalent_visits = equivalent_visits
         self._below: dict[State, tuple[float, float] | None] = {}  # value and reach by state, from operators alone
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
+        self._attainable = 0.0  # samples per second
         self._edges_evaluated = 0
         self._records_since_refresh = 0
         self._stale = True
@@ -694,7 +711,7 @@ class Tree(_Records):
     def price(self) -> float:
         """Finished samples that a second of device time is worth."""
         if self.reward == "rate":
-            return self.rate
+            return max(self.rate, self._attainable)
         seconds = self.seconds_per_rollout
         return 1.0 / seconds if seconds else 0.0
 
@@ -839,24 +856,47 @@ class Tree(_Records):
 
     def _back_up(self, node: _Node) -> None:
         """Value of a node: that of its best edge; nothing is worth waiting for what is not ready."""
-        edges: Iterable[_Edge] = node.edges.values()
-        if self._any_unready:
-            edges = [edge for edge in edges if self._may_go(edge.step)]
-        best = max(edges, key=lambda edge: edge.quality, default=None)
+        best = max(self._allowed(node.edges.values()), key=lambda edge: edge.quality, default=None)
         node.value, node.reach = (best.quality, best.reach) if best else (0.0, 0.0)
+
+    def _allowed(self, edges: Iterable[_Edge]) -> Iterable[_Edge]:
+        return [edge for edge in edges if self._may_go(edge.step)] if self._any_unready else edges
 
     def _refresh(self) -> None:
         """Recompute all predictions: operators, values by state, and the tree."""
         self._predict_operators()
-        self._below = {self.transitions.full: (1.0, 1.0)}
-        if self._states is not None:
-            self._solve_states(self.price)
-        else:
-            self._per_variable = self._share_among_variables()
+        self._attainable = 0.0
         self._edges_evaluated = 0
-        self._evaluate(self._root, self.price)
+        self._value_at(self.price)
+        for _ in range(PRICE_STEPS):
+            attainable = self._rate_of_the_best()
+            if attainable <= 1.1 * self.price:
+                break
+            self._attainable = attainable
+            self._value_at(self.price)
         self._records_since_refresh = 0
         self._stale = False
+
+    def _value_at(self, price: float) -> None:
+        """Values of all states and nodes at a price of time."""
+        self._version += 1
+        self._below = {self.transitions.full: (1.0, 1.0)}
+        if self._states is not None:
+            self._solve_states(price)
+        else:
+            self._per_variable = self._share_among_variables()
+        self._evaluate(self._root, price)
+
+    def _rate_of_the_best(self) -> float:
+        """Predicted rate of the sequence of greatest Q; 0 where it was not run yet to the end."""
+        node = self._root
+        while node.state != self.transitions.full:
+            edges = node.edges.values() if node.visited else ()
+            best = max(self._allowed(edges), key=lambda edge: edge.quality, default=None)
+            if best is None or best.history.statistics.tries < VISIT_TRIES:
+                return 0.0
+            node = self._behind(best)
+        return 1.0 / max(sum(self._predicted(history).item_cost for history in node.components), 1e-300)
 
     def _evaluate(self, node: _Node, price: float) -> None:
         """Values of the visited part of the tree, by its histories; of its leaves, by their states."""
@@ -972,7 +1012,7 @@ class Tree(_Records):
         return super().as_json()
 
     def _value_of(self, history: _History) -> dict[str, float]:
-        return {"q": self._follow(history.prefix)[-1].quality}
+        return {"q": self._follow(history.prefixes[0])[-1].quality}
 
     def add(self, data: dict[str, Any]) -> None:
         super().add(data)
