@@ -389,16 +389,15 @@ class Minimum(NamedTuple):
 
 
 def minimise(
-    cost: Callable[[jax.Array], jax.Array],
-    rows: Callable[[jax.Array], jax.Array],
+    measure: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     low: jax.Array,
     high: jax.Array,
     x: jax.Array,
     settings: CostSettings | None = None,
 ) -> Minimum:
-    """Minimises a smooth cost subject to `low <= rows(x) <= high` from x, for one lane (`jax.vmap` it over lanes).
+    """Minimises a smooth cost subject to `low <= rows <= high` from x, for one lane (`jax.vmap` it over lanes).
 
-    cost: `(n,)` to a number; rows: `(n,)` to `(m,)`; low, high: `(m,)`, infinite where open. The augmented Lagrangian
+    measure: `(n,)` to the cost, a number, and the rows `(m,)`; low, high: `(m,)`, infinite where open. The augmented Lagrangian
     `f + rho / 2 * |d(c + y / rho)|^2` is minimised by L-BFGS between the updates `y <- rho * d(c + y / rho)`. Samples do not
     need it and are more diverse without; with a cost the multipliers do not vanish, so that a penalty alone would stop short.
     """
@@ -407,8 +406,9 @@ def minimise(
     low, high = jnp.asarray(low, x.dtype), jnp.asarray(high, x.dtype)
 
     def lagrangian(x: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
-        outside = distance_to_interval(rows(x) + multipliers / penalty, low, high)
-        return cost(x) + 0.5 * penalty * jnp.sum(outside * outside)
+        cost, rows = measure(x)
+        outside = distance_to_interval(rows + multipliers / penalty, low, high)
+        return cost + 0.5 * penalty * jnp.sum(outside * outside)
 
     def descend(x: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
         def value(x: jax.Array) -> jax.Array:
@@ -429,24 +429,24 @@ def minimise(
         return lax.while_loop(unfinished, advance, start)[0]
 
     def update(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        x, multipliers, penalty, violation, count, _ = carry
+        x, multipliers, penalty, violation, count, _, _ = carry
         x = descend(x, multipliers, penalty)
-        value = rows(x)
+        cost, value = measure(x)
         renewed = penalty * distance_to_interval(value + multipliers / penalty, low, high)
         now = jnp.max(jnp.abs(distance_to_interval(value, low, high)))
         change = jnp.max(jnp.abs(renewed - multipliers)) / (1.0 + jnp.max(jnp.abs(renewed)))
         grown = jnp.minimum(penalty * settings.penalty_growth, settings.largest_penalty)
         slow = (now > 0.25 * violation) & (now > settings.tolerance)
-        return x, renewed, jnp.where(slow, grown, penalty), now, count + 1, change
+        return x, renewed, jnp.where(slow, grown, penalty), now, count + 1, change, cost
 
     def busy(carry: tuple[jax.Array, ...]) -> jax.Array:
-        _, _, _, violation, count, change = carry
+        _, _, _, violation, count, change, _ = carry
         converged = (violation <= settings.tolerance) & (change <= settings.multiplier_tolerance)
         return (count < settings.outer_iterations) & ~converged & ((count == 0) | jnp.isfinite(violation))
 
     infinite = jnp.asarray(jnp.inf, x.dtype)
-    start = (x, jnp.zeros_like(low), jnp.asarray(settings.penalty, x.dtype), infinite, jnp.zeros((), jnp.int32), infinite)
-    x, multipliers, _, violation, _, _ = lax.while_loop(busy, update, start)
-    value = cost(x)
+    penalty = jnp.asarray(settings.penalty, x.dtype)
+    start = (x, jnp.zeros_like(low), penalty, infinite, jnp.zeros((), jnp.int32), infinite, infinite)
+    x, multipliers, _, violation, _, _, value = lax.while_loop(busy, update, start)
     feasible = (violation <= settings.tolerance) & jnp.isfinite(value)
     return Minimum(x, value, feasible, violation, multipliers)

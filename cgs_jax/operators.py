@@ -23,7 +23,7 @@ from cgs_jax import augmented_lagrangian as al
 from cgs_jax.collisions import Body, ClearanceData, place_object, place_robot, smallest_distance
 from cgs_jax.constraints import OwnSampler, PoseRows, Term, row_data
 from cgs_jax.kinematics import Chain, joint_frames, padded, tool_pose, tool_poses_on_host
-from cgs_jax.plans import Layout, Plan, PlanSystem, Shared, make_plan
+from cgs_jax.plans import Layout, Plan, PlanSystem, Point, Shared, Tasks, make_plan
 from cgs_jax.poses import Array, Pose, compose, from_vector, inverse, to_vector
 from cgs_jax.problems import Params, Problem, pose_vector
 from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, draw_own, pose_seed, uniforms
@@ -39,6 +39,9 @@ SEED_CHUNK = 32
 """Lanes whose seeds are chosen at once; each has many candidates."""
 
 PyTree = Any
+
+Refine = Callable[[Point, Tasks, Shared], Point]
+"""Moves projected points, tasks last; gets the tasks' data and what they share."""
 
 
 class Numbers(NamedTuple):
@@ -90,11 +93,13 @@ def propose(
     given: Array,
     given_configurations: tuple[Array, ...],
     numbers: Numbers,
+    refine: Refine | None = None,
 ) -> Proposals:
     """Draws a seed for each task and projects it; pure.
 
     `given` is `(tasks, given, 7)`, `given_configurations` `(tasks, dof)` each. `count` (traced) of the tasks are in use. The
-    random stream of a task is a function of `key` (a key or its data) and `first_task + position`.
+    random stream of a task is a function of `key` (a key or its data) and `first_task + position`. `refine` moves the
+    projected points before they are judged.
     """
     tasks = given.shape[0]
     numbers = jax.tree.map(jnp.asarray, numbers)
@@ -122,6 +127,8 @@ def propose(
         x, iterations = projection.x, projection.iterations
     else:
         x, iterations = seeds, jnp.zeros((tasks,), jnp.int32)
+    if refine is not None:
+        x = refine(x, task_data, shared)
 
     def judge(part: PyTree) -> tuple[jax.Array, jax.Array]:
         point, data = part
@@ -359,6 +366,13 @@ class Operator:
             for k, (name, dof) in enumerate(zip(self.plan.configurations, self.dofs, strict=True))
         }
         return values | {name: proposals.poses[i] for i, name in enumerate(self.plan.poses)}
+
+    def of_one(self, name: str, configurations: Array, poses: Array) -> Array:
+        """A new variable `(dim,)` of one task, out of its configurations `(K, joints)` and poses `(outputs, 7)`."""
+        if name in self.plan.poses:
+            return poses[self.plan.poses.index(name)]
+        at = self.plan.configurations.index(name)
+        return configurations[at, : self.dofs[at]]
 
 
 _NO_CHAIN = Chain(

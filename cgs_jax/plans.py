@@ -687,6 +687,18 @@ class PlanSystem:
         jacobian = self._times_units(jacobian)
         return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
 
+    def values(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, Pose]:
+        """The rows' values `(m, lanes)` alone, and the new poses `(3, 3, outputs, lanes)`."""
+        tasks, shared = data
+        atoms, prefixes, _, _ = self._products(x, tasks, shared)
+        lanes = tasks.slack.shape[-1]
+        measured = pose_rows(prefixes.whole, _with_lane(shared.rows)).value
+        parts = [jnp.moveaxis(measured, 1, 0).reshape(6 * self.layout.words, lanes)]
+        for slot in self.layout.functions:
+            more, _ = function_rows(slot.function, self._arguments(slot, x, tasks, prefixes, None), self.layout.unknowns)
+            parts.append(jnp.broadcast_to(more, (slot.function.rows, lanes)))
+        return jnp.concatenate(parts), multiply_words(shared.code.outputs, atoms).whole
+
     def _arguments(
         self, slot: FunctionSlot, x: Point, tasks: Tasks, prefixes: Prefixes, tangents: jax.Array | None
     ) -> dict[str, FunctionArgument]:

@@ -290,7 +290,7 @@ def test_minimum_under_constraints(name):
     low, high = jnp.asarray(low), jnp.asarray(high)
     # Lanes beside each other, one at the given start and one elsewhere.
     starts = jnp.asarray([start, np.array(start) + 0.1])
-    result = jax.jit(jax.vmap(lambda x: al.minimise(cost, rows, low, high, x)))(starts)
+    result = jax.jit(jax.vmap(lambda x: al.minimise(lambda v: (cost(v), rows(v)), low, high, x)))(starts)
     assert result.feasible.all()
     np.testing.assert_allclose(result.x, np.tile(expected, (2, 1)), atol=1e-3)
     np.testing.assert_allclose(result.cost, cost(jnp.asarray(expected)), atol=2e-3)
@@ -300,9 +300,9 @@ def test_minimum_under_constraints(name):
 
 def test_minimum_under_contradictions_is_infeasible():
     result = al.minimise(
-        nearest_to([0.0]), lambda v: jnp.stack([v[0], v[0]]), jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]), jnp.zeros(1)
+        lambda v: (v @ v, jnp.stack([v[0], v[0]])), jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]), jnp.zeros(1)
     )
     assert not result.feasible and result.violation > 0.4
     assert not al.minimise(
-        lambda v: jnp.sqrt(v[0]), lambda v: v, jnp.array([-1.0]), jnp.array([-1.0]), jnp.ones(1)
+        lambda v: (jnp.sqrt(v[0]), v), jnp.array([-1.0]), jnp.array([-1.0]), jnp.ones(1)
     ).feasible

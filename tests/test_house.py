@@ -19,7 +19,9 @@ SCRIPTS = sorted((ROOT / "scripts").glob("*.py"))
 # Each module and all that it may know of. Two towers that never import each other: the search, which knows no scene and
 # no JAX, and the mathematics, which knows no graph; a thin bridge over both, and the porch.
 GRAPH = {"errors", "graph", "transitions", "uct"}
-MATHEMATICS = {"poses", "distance", "augmented_lagrangian", "kinematics", "constraints", "collisions", "plans", "seeds"}
+MATHEMATICS = {
+    "poses", "distance", "augmented_lagrangian", "kinematics", "constraints", "collisions", "plans", "seeds", "costs",
+}  # fmt: skip
 MAY_IMPORT = {
     # the search
     "errors": set(),
@@ -35,6 +37,7 @@ MAY_IMPORT = {
     "collisions": {"constraints", "distance", "kinematics", "poses"},
     "plans": {"augmented_lagrangian", "constraints", "kinematics", "poses"},
     "seeds": {"constraints", "plans", "poses"},
+    "costs": {"augmented_lagrangian", "plans", "poses"},
     # scenes, samples and what reads them
     "scene": {"errors"},
     "samples": {"errors"},
@@ -61,8 +64,8 @@ MAY_IMPORT = {
     # the porch
     "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
     "api": {
-        "errors", "augmented_lagrangian", "coverage", "operators", "poses", "problems", "record", "sampler", "samples",
-        "transitions", "uct",
+        "errors", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record", "sampler",
+        "samples", "transitions", "uct",
     },
 }  # fmt: skip
 
