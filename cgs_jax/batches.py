@@ -30,7 +30,7 @@ from cgs_jax.operators import (
     propose_program,
 )
 from cgs_jax.own import own_checks
-from cgs_jax.problems import Problem
+from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.scene import attachments, goals, placements
 from cgs_jax.transitions import Transition
 
@@ -88,6 +88,8 @@ class BatchSettings:
     solver: Settings
     counted_time: bool = False
     """Report counted work (`WORK_SECONDS`) in place of measured device time."""
+    collisions: Collisions = "after"
+    """Where clearances are seen to."""
 
 
 WORK_SECONDS = 1e-7
@@ -98,13 +100,13 @@ class BatchRunner:
     """Runs batches of one problem; may be shared by threads."""
 
     def __init__(self, problem: Problem, seed: int, settings: BatchSettings, tolerances: Tolerances | None = None) -> None:
-        self.problem, self.settings = problem, settings
+        self.problem, self.settings = with_collisions(problem, settings.collisions), settings
         task = problem.scene.task
         switches = [switch.name for switch in task.switches]
         self.auditor = Auditor(
             problem.scene.model, attachments(task), placements(task), goals(task), switches, tolerances, own_checks(problem)
         )
-        self._keyframes = Keyframes(problem)
+        self._keyframes = Keyframes(self.problem)
         self._seed = seed
         self._numbers: dict[Any, Any] = {}
         self._requested: dict[int, list[Future]] = {}
@@ -145,6 +147,8 @@ class BatchRunner:
         of_function = self._blank_configurations(operator.plan.given_configurations)
         arguments = (self._key_of(operator), np.uint32(0), scalar, given, of_function, self._numbers_of(operator))
         name = f"solve {layout.configurations} configurations, {layout.free} free poses"
+        if operator.inside:
+            name += f", {', '.join(operator.inside)}"
         own = layout.functions or layout.samplers
         key = None if own else f"propose {layout} {s.solver} {s.lanes}"
         futures = [programs.request(name, propose_program(layout, s.solver, s.lanes), arguments, key)]

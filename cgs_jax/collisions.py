@@ -15,7 +15,16 @@ import mujoco
 import numpy as np
 
 from cgs_jax.constraints import Product
-from cgs_jax.distance import box_box_distance, capsule_box_distance, capsule_capsule_distance
+from cgs_jax.distance import (
+    Separation,
+    box_box,
+    box_box_distance,
+    capsule_box,
+    capsule_box_distance,
+    capsule_capsule,
+    capsule_capsule_distance,
+    materialise,
+)
 from cgs_jax.kinematics import Chain, joint_frames
 from cgs_jax.poses import Array, Pose, matmul, matvec
 
@@ -100,8 +109,11 @@ def place_links(shapes: Shapes, rotations: jax.Array, positions: jax.Array) -> P
     )
 
 
-def place_robot(shapes: Shapes, chain: Chain, q: Array, base: Pose | None) -> PlacedShapes:
-    """Shapes of a robot at `q` `(n, lanes)`; `base` is its root frame in the world, None for a fixed base."""
+def link_frames(chain: Chain, q: Array, base: Pose | None) -> tuple[jax.Array, jax.Array]:
+    """Root and joint frames of a robot at `q` `(n, lanes)` in the world: `(n + 1, 3, 3, lanes)`, `(n + 1, 3, lanes)`.
+
+    `base` is the root frame in the world, None for a fixed base.
+    """
     frames = joint_frames(chain, q)
     lanes = q.shape[1]
     root = Pose(jnp.broadcast_to(jnp.eye(3)[..., None], (3, 3, lanes)), jnp.zeros((3, lanes)))
@@ -112,7 +124,12 @@ def place_robot(shapes: Shapes, chain: Chain, q: Array, base: Pose | None) -> Pl
         moved = jnp.moveaxis(positions, 0, 1)
         positions = jnp.moveaxis(base.position[:, None] + matvec(turn, moved), 1, 0)
         rotations = jnp.moveaxis(matmul(turn[:, :, :, :], jnp.moveaxis(rotations, 0, 2)), 2, 0)
-    return place_links(shapes, rotations, positions)
+    return rotations, positions
+
+
+def place_robot(shapes: Shapes, chain: Chain, q: Array, base: Pose | None) -> PlacedShapes:
+    """Shapes of a robot at `q` `(n, lanes)`; `base` is its root frame in the world, None for a fixed base."""
+    return place_links(shapes, *link_frames(chain, q, base))
 
 
 def place_object(shapes: Shapes, pose: Pose | None) -> PlacedShapes:
@@ -122,35 +139,96 @@ def place_object(shapes: Shapes, pose: Pose | None) -> PlacedShapes:
     return place_links(shapes, pose.rotation[None], pose.position[None])
 
 
-def smallest_distance(bodies: list[PlacedShapes], pairs: Pairs) -> jax.Array:
-    """Smallest signed distance (m) per lane over the pairs, `(lanes,)`; FAR without pairs. Negative is penetration."""
+def _joined(bodies: list[PlacedShapes]) -> PlacedShapes:
+    """The shapes of all bodies in order, all with their lanes."""
     lanes = max(max(body.starts.shape[-1], body.centres.shape[-1]) for body in bodies)
 
-    def gather(field: str, index: Array) -> jax.Array:
+    def joined(field: str) -> jax.Array:
         parts = [getattr(body, field) for body in bodies]
-        parts = [jnp.broadcast_to(part, part.shape[:-1] + (lanes,)) for part in parts]
-        return jnp.take(jnp.concatenate(parts, axis=-2), jnp.asarray(index), axis=-2)
+        return jnp.concatenate([jnp.broadcast_to(part, part.shape[:-1] + (lanes,)) for part in parts], axis=-2)
 
-    def capsules(index: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return gather("starts", index), gather("ends", index), gather("radii", index)
+    return PlacedShapes(*map(joined, PlacedShapes._fields))
 
-    def boxes(index: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return gather("centres", index), gather("rotations", index), gather("halves", index)
 
-    distances = [jnp.full((lanes,), FAR)]
-    first, second = pairs.capsule_capsule
-    if first.shape[0]:
-        distances.append(jnp.min(capsule_capsule_distance(*capsules(first), *capsules(second)), axis=0))
-    first, second = pairs.capsule_box
-    if first.shape[0]:
-        distances.append(jnp.min(capsule_box_distance(*capsules(first), *boxes(second)), axis=0))
-    first, second = pairs.box_box
-    if first.shape[0]:
-        distances.append(jnp.min(box_box_distance(*boxes(first), *boxes(second)), axis=0))
-    result = distances[0]
-    for distance in distances[1:]:
-        result = jnp.minimum(result, distance)
+def _capsules(shapes: PlacedShapes, index: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    starts, ends, radii = (jnp.take(a, jnp.asarray(index), axis=-2) for a in (shapes.starts, shapes.ends, shapes.radii))
+    return starts, ends, radii
+
+
+def _boxes(shapes: PlacedShapes, index: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    fields = (shapes.centres, shapes.rotations, shapes.halves)
+    centres, rotations, halves = (jnp.take(a, jnp.asarray(index), axis=-2) for a in fields)
+    return centres, rotations, halves
+
+
+_KINDS = (
+    ("capsule_capsule", _capsules, _capsules, capsule_capsule_distance, capsule_capsule),
+    ("capsule_box", _capsules, _boxes, capsule_box_distance, capsule_box),
+    ("box_box", _boxes, _boxes, box_box_distance, box_box),
+)
+"""Field of `Pairs`, what its two rows number, distance and separation of such a pair."""
+
+
+def smallest_distance(bodies: list[PlacedShapes], pairs: Pairs) -> jax.Array:
+    """Smallest signed distance (m) per lane over the pairs, `(lanes,)`; FAR without pairs. Negative is penetration."""
+    shapes = _joined(bodies)
+    result = jnp.full(shapes.starts.shape[-1:], FAR)
+    for field, first, second, distance, _ in _KINDS:
+        index = getattr(pairs, field)
+        if index.shape[1]:
+            measured = distance(*first(shapes, index[0]), *second(shapes, index[1]))
+            result = jnp.minimum(result, jnp.min(measured, axis=0))
     return result
+
+
+class Contact(NamedTuple):
+    """The nearest pair of each lane; A and B as in `Separation`."""
+
+    separation: Separation  # fields (lanes,), (3, lanes)
+    bodies: jax.Array  # (2, lanes) int32 body of A and of B
+    links: jax.Array  # (2, lanes) int32 link of each in its body
+
+
+def nearest_contact(bodies: list[PlacedShapes], shapes: tuple[Shapes, ...], pairs: Pairs) -> Contact:
+    """The pair with the smallest signed distance per lane; without pairs a distance of FAR and no normal.
+
+    All pairs are measured, but only the nearest of each kind is looked at for its normal and points.
+    """
+    placed = materialise(_joined(bodies))
+    lanes = placed.starts.shape[-1]
+    owners = {}
+    for kind, links in (("capsules", "capsule_links"), ("boxes", "box_links")):
+        of_body = [np.full(getattr(s, links).shape[0], i, np.int32) for i, s in enumerate(shapes)]
+        owners[kind] = jnp.asarray(np.concatenate(of_body)), jnp.concatenate([jnp.asarray(getattr(s, links)) for s in shapes])
+    nothing = Separation(jnp.full((lanes,), FAR), *(jnp.zeros((3, lanes)) for _ in range(3)))
+    best = Contact(nothing, jnp.zeros((2, lanes), jnp.int32), jnp.zeros((2, lanes), jnp.int32))
+    for field, first, second, distance, separate in _KINDS:
+        index = jnp.asarray(getattr(pairs, field))
+        if not index.shape[1]:
+            continue
+        measured = materialise(distance(*first(placed, index[0]), *second(placed, index[1])))
+        # Two minima: XLA's CPU argmin goes element by element.
+        numbers = jnp.arange(index.shape[1], dtype=jnp.int32)[:, None]
+        nearest = jnp.min(jnp.where(measured <= jnp.min(measured, axis=0), numbers, index.shape[1]), axis=0)
+        nearest = jnp.minimum(nearest, index.shape[1] - 1)  # no distance is a number: the last pair
+        sides = index[:, nearest]  # (2, lanes)
+
+        def chosen(side: jax.Array, of_capsules: bool) -> list[jax.Array]:
+            fields = ("starts", "ends", "radii") if of_capsules else ("centres", "rotations", "halves")
+            arrays = [getattr(placed, name) for name in fields]
+            at = [side.reshape((1,) * (a.ndim - 1) + (lanes,)) for a in arrays]
+            return [jnp.take_along_axis(a, i, axis=-2)[..., 0, :] for a, i in zip(arrays, at, strict=True)]
+
+        kinds = ["capsules" if get is _capsules else "boxes" for get in (first, second)]
+        separation = separate(*(part for side, k in zip(sides, kinds, strict=True) for part in chosen(side, k == "capsules")))
+        here = Contact(
+            separation,
+            jnp.stack([owners[k][0][side] for side, k in zip(sides, kinds, strict=True)]),
+            jnp.stack([owners[k][1][side] for side, k in zip(sides, kinds, strict=True)]),
+        )
+        nearer = separation.distance < best.separation.distance
+        best = jax.tree.map(lambda new, old, nearer=nearer: jnp.where(nearer, new, old), here, best)
+    return best._replace(separation=materialise(best.separation))
 
 
 # ------------------------------------------------------------------ host: reading shapes from a model

@@ -118,7 +118,7 @@ def _stack(v: Vector, shape: tuple[int, ...]) -> jax.Array:
     return jnp.stack([jnp.broadcast_to(component, shape) for component in v])
 
 
-def _materialise(values):
+def materialise(values):
     """The same tree of arrays, computed once.
 
     XLA:CPU fuses a producer into each of its consumers and runs it again for each output and each row of a stacked one,
@@ -351,9 +351,9 @@ def _gap_to_box(point: Vector, half: Vector) -> Vector:
 
 def _capsule_box_contact(a0, a1, ra, centre, rotation, half) -> tuple[Separation, jax.Array]:
     half = _components(half)
-    start, span = _materialise(_segment_in_box_frame(a0, a1, centre, rotation))
+    start, span = materialise(_segment_in_box_frame(a0, a1, centre, rotation))
     separations = _separations_of_segment(start, span, half)
-    nearest, depth, number = _materialise(
+    nearest, depth, number = materialise(
         (_nearest_to_box(start, span, half), _largest(separations), _axis_number(separations, [True] * 6))
     )
     gap = _gap_to_box(_along(start, nearest, span), half)
@@ -363,7 +363,7 @@ def _capsule_box_contact(a0, a1, ra, centre, rotation, half) -> tuple[Separation
     outward, deepest = _deepest_in_box(number, start, span, half)
     normal = _select(apart, tuple(scale * g for g in gap), tuple(-n for n in outward))
     core, parameter = jnp.where(apart, length, depth), jnp.where(apart, nearest, deepest)
-    normal, core, parameter = _materialise((normal, core, parameter))
+    normal, core, parameter = materialise((normal, core, parameter))
     normal = _rotate(rotation, normal)
     point = a0 + parameter * (a1 - a0)
     distance = core - ra
@@ -463,23 +463,23 @@ def _half_toward(cosine: jax.Array, half: jax.Array) -> jax.Array:
 
 
 def _box_box_contact(centre_a, rotation_a, half_a, centre_b, rotation_b, half_b) -> Separation:
-    offset, axes_b = _materialise(_boxes_in_first_frame(centre_a, rotation_a, centre_b, rotation_b))
+    offset, axes_b = materialise(_boxes_in_first_frame(centre_a, rotation_a, centre_b, rotation_b))
     faces = _face_separations(offset, axes_b, half_a, half_b)
     edges, sines = _edge_separations(offset, axes_b, half_a, half_b)
     witnesses = [True] * 6 + [square > WITNESS_SINE_SQUARED for square in sines]
-    bound, number = _materialise((_largest(faces + edges), _axis_number(faces + edges, witnesses)))
+    bound, number = materialise((_largest(faces + edges), _axis_number(faces + edges, witnesses)))
 
     of_a, of_b = number < 3, (number >= 3) & (number < 6)
     edge_a = _one_hot(jnp.where(of_a, number, jnp.floor((number - 6) / 3)))
     hot_b = _one_hot(jnp.where(of_b, number - 3, jnp.mod(number - 6, 3)))
-    edge_b = _materialise(sum(hot * axis for hot, axis in zip(hot_b, axes_b)))
+    edge_b = materialise(sum(hot * axis for hot, axis in zip(hot_b, axes_b)))
     normal = _select(of_a, edge_a, _select(of_b, edge_b, _cross(edge_a, edge_b)))
     scale = _sign(_dot(normal, offset)) / jnp.sqrt(_larger(_dot(normal, normal), TINY))
-    normal = _materialise(tuple(scale * n for n in normal))
+    normal = materialise(tuple(scale * n for n in normal))
 
     support_a = tuple(_half_toward(n, h) for n, h in zip(normal, half_a))
     corner = [_half_toward(-_dot(axis, normal), h) for axis, h in zip(axes_b, half_b)]
-    support_b = _materialise(offset + sum(c * axis for c, axis in zip(corner, axes_b)))
+    support_b = materialise(offset + sum(c * axis for c, axis in zip(corner, axes_b)))
     # On an edge pair both supports are mid-edge: slide along B's edge until the two lines are nearest each other.
     crosswise = _cross(edge_a, normal)
     sideways = _dot(crosswise, edge_b)
@@ -487,7 +487,7 @@ def _box_box_contact(centre_a, rotation_a, half_a, centre_b, rotation_b, half_b)
     slide = jnp.where(of_a, 0.0, slide)
     point_b = _select(of_b, _along(support_a, bound, normal), _along(support_b, slide, edge_b))
     normal = _rotate(rotation_a, normal)
-    point_b = centre_a + _rotate(rotation_a, _materialise(point_b))
+    point_b = centre_a + _rotate(rotation_a, materialise(point_b))
     return Separation(bound, normal, point_b - bound * normal, point_b)
 
 

@@ -290,6 +290,9 @@ class Operator:
     measured: tuple[str, ...]
     plan: Plan
     clears: tuple[Clear, ...]
+    """Clearances that are checked after the solver."""
+    inside: tuple[str, ...]
+    """Constraints whose clearance the solver keeps by a row."""
     tables: tuple[str, ...]
     """Seed table of each new configuration."""
     dofs: tuple[int, ...]
@@ -315,7 +318,7 @@ class Operator:
         ]
         silent = row_data("located", low=[-np.inf] * 3, high=[np.inf] * 3)
         rows = [params.rows[name] if name else silent for name in plan.rows]
-        rows += [silent] * (layout.words - len(rows))
+        rows += [silent] * (layout.words - layout.bare - len(rows))
         seeds = []
         for _, name in plan.free:
             seed = params.seeds[name] if name else pose_seed(None)
@@ -326,6 +329,7 @@ class Operator:
                 code=plan.code,
                 chains=_stack(chains),
                 rows=_stack(rows),
+                clearances=tuple(params.clearances[name] for name in self.inside),
             ),
             tables=Tables(
                 configurations=_pad([t.configurations for t in tables], (layout.joints, size)),
@@ -420,6 +424,8 @@ def operator_of(problem: Problem, transition: Transition) -> Operator:
 def _bind(problem: Problem, transition: Transition) -> Operator:
     active = transition.constraints
     declarations = {name: problem.declarations[name] for name in active if name in problem.declarations}
+    clearances = {name: problem.clearances[name].bodies for name in active if name in problem.clearances}
+    inside = clearances if problem.collisions == "inside" else {}
     touches = sum(isinstance(d, PoseRows) and d.form == "touch" for d in problem.declarations.values())
     plan = make_plan(
         transition.new,
@@ -430,14 +436,16 @@ def _bind(problem: Problem, transition: Transition) -> Operator:
         touches,
         {name: _widths(*problem.params.limits[name]) for name in problem.vectors},
         _samplers(problem, transition),
+        inside,
     )
     return Operator(
         new=transition.new,
         condition=problem.graph.ordered(transition.condition),
         constraints=active,
-        measured=tuple(declarations),
+        measured=tuple(dict.fromkeys([*declarations, *inside])),
         plan=plan,
-        clears=tuple(bind_clearance(n, problem.clearances[n].bodies) for n in active if n in problem.clearances),
+        clears=tuple(bind_clearance(name, bodies) for name, bodies in clearances.items() if name not in inside),
+        inside=tuple(inside),
         tables=tuple(problem.table_of[name] for name in plan.configurations),
         dofs=tuple(problem.dofs[name] or 0 for name in plan.configurations),
         identity=zlib.crc32(repr(transition.problem).encode()),

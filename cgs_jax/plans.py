@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 
 from cgs_jax.augmented_lagrangian import Rows
+from cgs_jax.collisions import Body, ClearanceData, PlacedShapes, link_frames, nearest_contact, place_links, place_object
 from cgs_jax.constraints import (
     Declaration,
     Function,
@@ -35,6 +36,7 @@ from cgs_jax.constraints import (
     inverted,
     pose_rows,
 )
+from cgs_jax.distance import materialise
 from cgs_jax.kinematics import Chain, joint_frames, tool_jacobian, tool_pose
 from cgs_jax.poses import Array, Pose, cross, matmul, matvec, retract, transpose
 
@@ -60,6 +62,23 @@ class SamplerSlot(NamedTuple):
     sampler: OwnSampler
     arguments: tuple[tuple[str, int, int], ...]
     results: tuple[tuple[str, int, int], ...]
+class BodySlot(NamedTuple):
+    """A body of a clearance and where it is: position of its configuration (-1: none) and of its pose's word (-1: none)."""
+
+    kind: str  # "robot", "object", "still"
+    configuration: int
+    word: int
+
+
+class ClearanceSlot(NamedTuple):
+    """A clearance that is kept by a row: its smallest signed distance must not be negative."""
+
+    bodies: tuple[BodySlot, ...]
+    constraint: int
+
+
+AIM = 2e-3
+"""Largest clearance (m) that a penetrating pair is moved to; each lane has its own."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +115,10 @@ class Layout:
     """Which of the new configurations are a user's vectors."""
     units: tuple[float, ...] = ()
     """Change of each number per unit of its unknown (n,); empty where all are one."""
+    clearances: tuple[ClearanceSlot, ...] = ()
+    """Clearances that have a row."""
+    bare: int = 0
+    """Words at the end that only clearances read; they have no rows."""
 
     @property
     def unknowns(self) -> int:
@@ -125,7 +148,8 @@ class Layout:
     @property
     def solves(self) -> bool:
         """Whether there is anything to solve: without, drawing the free poses is all (and judging what is defined)."""
-        closed_form = not (self.configurations or self.functions or self.samplers) and self.words <= self.free
+        closed_form = not (self.configurations or self.functions or self.samplers or self.clearances)
+        closed_form &= self.words - self.bare <= self.free
         return bool(self.unknowns) and not closed_form
 
 
@@ -188,7 +212,7 @@ class Plan:
     poses: tuple[str, ...]
     """New pose variables in the order of the output words."""
     given_configurations: tuple[str, ...]
-    """Given configurations and vectors that a user's function or sampler reads."""
+    """Given configurations and vectors that a user's function or sampler, or a clearance's row reads."""
 
 
 def make_plan(
@@ -200,11 +224,13 @@ def make_plan(
     sites: int,
     ranges: Mapping[str, tuple[float, ...]] | None = None,
     samplers: Sequence[OwnSampler] = (),
+    clearances: Mapping[str, Sequence[Body]] | None = None,
 ) -> Plan:
     """Plans the conditional problem of `new` variables under active constraints.
 
     `dofs` has each configuration variable's number of joints, None for a pose; `lengths` the joints of each chain; `joints`
-    and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). Poses are
+    and `sites` the most that any robot and any conditional problem of the task has (so that layouts are shared). `clearances`
+    has the bodies of those that are to be kept by a row, by constraint. Poses are
     defined greedily: configurations are taken one by one, always the one that completes most products; where every loop left
     has two or more unknown poses, one of them becomes free. `ranges` has the widths of a user's vectors, which are planned as
     configurations without tools; `samplers` those that draw here, in order: a pose that one draws is free from the start.
@@ -220,9 +246,8 @@ def make_plan(
         loops = [d for n, d in declarations.items() if isinstance(d, PoseRows) and d.form == "closed" and n not in read]
         stuck = [p for d in loops for p in d.scope if p in undetermined]
         free.append((stuck or undetermined)[0])
-    return _Assembler(
-        order, new_poses, free, defined, read, declarations, dofs, lengths, joints, sites, ranges or {}, samplers
-    ).plan()
+    known = ranges or {}, samplers, clearances or {}
+    return _Assembler(order, new_poses, free, defined, read, declarations, dofs, lengths, joints, sites, *known).plan()
 
 
 class _Definition(NamedTuple):
@@ -315,7 +340,9 @@ class _Assembler:
         sites: int,
         ranges: Mapping[str, tuple[float, ...]],
         samplers: Sequence[OwnSampler],
+        clearances: Mapping[str, Sequence[Body]],
     ) -> None:
+        self.clearances = clearances
         self.order, self.new_poses, self.free = order, new_poses, free
         self.declarations, self.dofs, self.lengths, self.joints, self.sites = declarations, dofs, lengths, joints, sites
         self.ranges, self.samplers = ranges, samplers
@@ -350,6 +377,11 @@ class _Assembler:
     def plan(self) -> Plan:
         outputs = [self._substituted((Term("pose", name),)) for name in self.new_poses]
         products = [product for _, product, _ in self.words]
+        reading = max(len(products), len(self.order) + len(self.free), 1)
+        products += [()] * (reading - len(products) if self.clearances else 0)
+        bodies = [body for of_clearance in self.clearances.values() for body in of_clearance]
+        bare = list(dict.fromkeys(self._substituted(body.pose) for body in bodies if body.pose))
+        products += bare
         given: dict[Term, None] = {}
         tools: dict[str, dict[str, None]] = {name: {} for name in self.order}
         sites: dict[str, None] = {}
@@ -362,7 +394,7 @@ class _Assembler:
                 given[Term(term.kind, term.name, term.variable)] = None
         given |= dict.fromkeys(Term("pose", v) for v in self._read_by_samplers() if self.dofs[v] is None)
         chains = max([len(names) for names in tools.values()], default=1) or 1
-        words = max(len(products), len(self.order) + len(self.free), 1)
+        words = reading + len(bare)
         first_tool = 1 + _rounded(max(len(given), 1), 12) + self.sites
         atoms: dict[Term, int] = {term: 1 + i for i, term in enumerate(given)}
         atoms |= {Term("site", name): first_tool - self.sites + i for i, name in enumerate(sites)}
@@ -371,7 +403,7 @@ class _Assembler:
                 atoms[Term("chain", chain, name)] = first_tool + k * chains + i
         first_free = first_tool + len(self.order) * chains
         atoms |= {Term("pose", name): first_free + i for i, name in enumerate(self.free)}
-        constraints = list(self.declarations)
+        constraints = list(dict.fromkeys([*self.declarations, *self.clearances]))
         of_configurations = _places(products, lambda t: self.order.index(t.variable) if t.variable in self.order else -1)
         of_free = _places(products, lambda t: self.free.index(t.name) if t.kind == "pose" and t.name in self.free else -1)
         layout = Layout(
@@ -393,6 +425,11 @@ class _Assembler:
             samplers=tuple(self._sampler_slot(sampler, list(given)) for sampler in self.samplers),
             vectors=tuple(k for k, name in enumerate(self.order) if name in self.ranges),
             units=self._units(),
+            clearances=tuple(
+                ClearanceSlot(tuple(self._body(body, bare, reading) for body in of_clearance), constraints.index(name))
+                for name, of_clearance in self.clearances.items()
+            ),
+            bare=len(bare),
         )
         stage = np.full(words, len(self.order) + 1, np.int32)
         constraint = np.full(words, layout.constraints, np.int32)
@@ -417,12 +454,17 @@ class _Assembler:
             free=tuple((name, self._seed_of(name)) for name in self.free),
             rows=tuple(name for name, _, _ in self.words),
             poses=tuple(self.new_poses),
-            given_configurations=tuple(self._function_configurations()),
+            given_configurations=tuple(self._read_configurations()),
         )
 
-    def _function_configurations(self) -> list[str]:
-        scopes = [v for f in self.functions.values() for v in f.scope] + self._read_by_samplers()
-        return list(dict.fromkeys(v for v in scopes if self.dofs[v] is not None and v not in self.order))
+    def _read_configurations(self) -> list[str]:
+        read = [v for f in self.functions.values() for v in f.scope] + self._read_by_samplers()
+        read += [body.variable for bodies in self.clearances.values() for body in bodies if body.variable]
+        return list(dict.fromkeys(v for v in read if self.dofs[v] is not None and v not in self.order))
+
+    def _body(self, body: Body, bare: list[Product], first: int) -> BodySlot:
+        at = [*self.order, *self._read_configurations()].index(body.variable) if body.variable else -1
+        return BodySlot(body.kind, at, first + bare.index(self._substituted(body.pose)) if body.pose else -1)
 
     def _read_by_samplers(self) -> list[str]:
         """Given variables that samplers read."""
@@ -449,7 +491,7 @@ class _Assembler:
                 return "drawn", 0, 0
             if dof is None:
                 return "pose", given.index(Term("pose", variable)), 7
-            return "configuration", self._function_configurations().index(variable), dof
+            return "configuration", self._read_configurations().index(variable), dof
 
         def result(variable: str) -> tuple[str, int, int]:
             dof = self.dofs[variable]
@@ -462,7 +504,7 @@ class _Assembler:
         if dof is None:
             own = len(self.words) - len(self.read_by_functions)
             return "word", own + list(self.read_by_functions).index(variable), 7
-        return "configuration", [*self.order, *self._function_configurations()].index(variable), dof
+        return "configuration", [*self.order, *self._read_configurations()].index(variable), dof
 
     def _seed_of(self, pose: str) -> str | None:
         """The constraint on a free pose alone that its seed is drawn from."""
@@ -516,7 +558,8 @@ class Shared(NamedTuple):
 
     code: Code
     chains: Chain  # stacked on the last axis: tools of the new configurations in order, (..., tools)
-    rows: RowData  # stacked on the last axis, (..., words)
+    rows: RowData  # stacked on the last axis, (..., words that have rows)
+    clearances: tuple[ClearanceData, ...] = ()  # of those that have a row
 
 
 class Tasks(NamedTuple):
@@ -526,7 +569,7 @@ class Tasks(NamedTuple):
     low: Array  # (configurations, joints, lanes) limits that the solver keeps to
     high: Array  # (configurations, joints, lanes)
     slack: Array  # (2, lanes) in [0, 1): how far inside an interval a violated row is pulled
-    configurations: tuple[Array, ...]  # given ones that functions read, (dof, lanes)
+    configurations: tuple[Array, ...]  # given ones that functions and clearances read, (dof, lanes)
 
 
 class Point(NamedTuple):
@@ -668,10 +711,11 @@ class PlanSystem:
             tangent = _carried(code.free, identity, x.free.position, prefixes, layout.free)
             parts.append(_by_word(tangent, layout.words, layout.free))
         tangents = jnp.concatenate(parts, axis=2) if len(parts) > 1 else parts[0]  # (words, 6, n, lanes)
-        measured = pose_rows(prefixes.whole, _with_lane(shared.rows))
-        value = jnp.moveaxis(measured.value, 1, 0).reshape(6 * layout.words, lanes)
-        jacobian = jnp.concatenate([tangents[:, :3], _turn_rows(measured.turn, tangents[:, 3:])], axis=1)
-        jacobian = jacobian.reshape(6 * layout.words, layout.unknowns, lanes)
+        read = layout.words - layout.bare
+        measured = pose_rows(self._with_rows(prefixes), _with_lane(shared.rows))
+        value = jnp.moveaxis(measured.value, 1, 0).reshape(6 * read, lanes)
+        jacobian = jnp.concatenate([tangents[:read, :3], _turn_rows(measured.turn, tangents[:read, 3:])], axis=1)
+        jacobian = jacobian.reshape(6 * read, layout.unknowns, lanes)
         low, high = (jnp.asarray(bound).T.reshape(-1, 1) for bound in (shared.rows.low, shared.rows.high))
         for slot in layout.functions:
             arguments = self._arguments(slot, x, tasks, prefixes, tangents)
@@ -684,19 +728,93 @@ class PlanSystem:
             high = jnp.concatenate([high, jnp.zeros((size, 1))])
         width = high - low
         inside = jnp.where(jnp.isfinite(width), 0.5 * width, 0.0)
-        jacobian = self._times_units(jacobian)
-        return Rows(value, low, high, low + tasks.slack[0] * inside, high - tasks.slack[1] * inside, jacobian)
+        aim_low, aim_high = low + tasks.slack[0] * inside, high - tasks.slack[1] * inside
+        for slot, clearance in zip(layout.clearances, shared.clearances, strict=True):
+            distance, slope = self._clearance(slot, clearance, x, tasks, prefixes, tangents)
+            value, jacobian = jnp.concatenate([value, distance[None]]), jnp.concatenate([jacobian, slope[None]])
+            low, high = jnp.concatenate([low, jnp.zeros((1, 1))]), jnp.concatenate([high, jnp.full((1, 1), jnp.inf)])
+            aim_low = jnp.concatenate([aim_low, AIM * tasks.slack[:1]])
+            aim_high = jnp.concatenate([aim_high, jnp.full((1, lanes), jnp.inf)])
+        return Rows(value, low, high, aim_low, aim_high, self._times_units(jacobian))
+
+    def _with_rows(self, prefixes: Prefixes) -> Pose:
+        read = self.layout.words - self.layout.bare
+        return Pose(prefixes.whole.rotation[:, :, :read], prefixes.whole.position[:, :read])
+
+    def _clearance(
+        self,
+        slot: ClearanceSlot,
+        data: ClearanceData,
+        x: Point,
+        tasks: Tasks,
+        prefixes: Prefixes,
+        tangents: jax.Array | None,
+    ) -> tuple[jax.Array, jax.Array]:
+        """Smallest signed distance `(lanes,)` of a clearance, and its derivative `(n, lanes)` through the nearest pair.
+
+        The nearest pair's distance changes by the normal's part in the relative velocity of its two points.
+        """
+        layout, lanes = self.layout, tasks.slack.shape[-1]
+        placed: list[PlacedShapes] = []
+        joints: list[tuple[jax.Array, jax.Array] | None] = []
+        chains = iter(data.chains)
+        of_robot: list[Chain | None] = []
+        for body, shapes in zip(slot.bodies, data.shapes, strict=True):
+            pose = None
+            if body.word >= 0:
+                pose = Pose(prefixes.whole.rotation[:, :, body.word], prefixes.whole.position[:, body.word])
+            if body.kind != "robot":
+                placed.append(place_object(shapes, pose))
+                joints.append(None)
+                of_robot.append(None)
+                continue
+            chain = next(chains)
+            if body.configuration < layout.configurations:
+                q = x.configurations[body.configuration, : chain.offset.shape[0]]
+            else:
+                q = tasks.configurations[body.configuration - layout.configurations]
+            frames = link_frames(chain, q, pose)
+            placed.append(place_links(shapes, *frames))
+            joints.append(frames)
+            of_robot.append(chain)
+        contact = nearest_contact(placed, data.shapes, data.pairs)
+        apart = contact.separation
+        distance = jnp.broadcast_to(apart.distance, (lanes,))
+        slope = jnp.zeros((layout.unknowns, lanes))
+        if tangents is None:
+            return distance, slope
+        for k, (body, frames, chain) in enumerate(zip(slot.bodies, joints, of_robot, strict=True)):
+            for side, (sign, point) in enumerate(((-1.0, apart.point_a), (1.0, apart.point_b))):
+                push = jnp.where(contact.bodies[side] == k, sign, 0.0) * apart.normal  # (3, lanes)
+                if body.word >= 0:
+                    arm = point - prefixes.whole.position[:, body.word]
+                    wrench = jnp.concatenate([push, cross(arm, push)])
+                    slope = slope + jnp.sum(tangents[body.word] * wrench[:, None], axis=0)
+                if frames is None or chain is None or body.configuration >= layout.configurations:
+                    continue
+                axis, origin = frames[0][1:, :, 2], frames[1][1:]  # (joints, 3, lanes)
+                lever = jnp.moveaxis(point[None] - origin, 1, 0)
+                axis = jnp.moveaxis(axis, 1, 0)  # (3, joints, lanes)
+                hinge, slide = (jnp.asarray(a)[:, None] for a in (chain.hinge, chain.slide))
+                velocity = cross(axis, lever) * hinge + axis * slide
+                moves = contact.links[side][None] > jnp.arange(axis.shape[1])[:, None]
+                part = jnp.where(moves, jnp.sum(velocity * push[:, None], axis=0), 0.0)
+                first = body.configuration * layout.joints
+                slope = slope.at[first : first + axis.shape[1]].add(part)
+        return materialise((distance, slope))
 
     def values(self, x: Point, data: tuple[Tasks, Shared]) -> tuple[jax.Array, Pose]:
         """The rows' values `(m, lanes)` alone, and the new poses `(3, 3, outputs, lanes)`."""
         tasks, shared = data
         atoms, prefixes, _, _ = self._products(x, tasks, shared)
         lanes = tasks.slack.shape[-1]
-        measured = pose_rows(prefixes.whole, _with_lane(shared.rows)).value
-        parts = [jnp.moveaxis(measured, 1, 0).reshape(6 * self.layout.words, lanes)]
+        measured = pose_rows(self._with_rows(prefixes), _with_lane(shared.rows)).value
+        parts = [jnp.moveaxis(measured, 1, 0).reshape(-1, lanes)]
         for slot in self.layout.functions:
             more, _ = function_rows(slot.function, self._arguments(slot, x, tasks, prefixes, None), self.layout.unknowns)
             parts.append(jnp.broadcast_to(more, (slot.function.rows, lanes)))
+        for clear, clearance in zip(self.layout.clearances, shared.clearances, strict=True):
+            parts.append(self._clearance(clear, clearance, x, tasks, prefixes, None)[0][None])
         return jnp.concatenate(parts), multiply_words(shared.code.outputs, atoms).whole
 
     def _arguments(
@@ -753,16 +871,19 @@ class PlanSystem:
         layout = self.layout
         lanes = tasks.slack.shape[-1]
         atoms, prefixes, _, _ = self._products(x, tasks, shared)
-        value = pose_rows(prefixes.whole, _with_lane(shared.rows)).value
+        value = pose_rows(self._with_rows(prefixes), _with_lane(shared.rows)).value
         low, high = (jnp.asarray(bound)[..., None] for bound in (shared.rows.low, shared.rows.high))
         worst = jnp.max(jnp.abs(value - jnp.clip(value, low, high)), axis=0)  # (words, lanes)
         worst = jnp.where(jnp.isfinite(worst), worst, jnp.inf)
-        result = jnp.zeros((layout.constraints + 1, lanes), value.dtype).at[shared.code.constraint].max(worst)
+        result = jnp.zeros((layout.constraints + 1, lanes), value.dtype).at[shared.code.constraint[: value.shape[1]]].max(worst)
         for slot in layout.functions:
             more, _ = function_rows(slot.function, self._arguments(slot, x, tasks, prefixes, None), layout.unknowns)
             gap = jnp.abs(more) if slot.function.kind == "equality" else jnp.maximum(more, 0.0)
             gap = jnp.where(jnp.isfinite(gap), gap, jnp.inf)
             result = result.at[slot.constraint].max(jnp.broadcast_to(jnp.max(gap, axis=0), (lanes,)))
+        for clear, clearance in zip(layout.clearances, shared.clearances, strict=True):
+            distance, _ = self._clearance(clear, clearance, x, tasks, prefixes, None)
+            result = result.at[clear.constraint].max(jnp.where(jnp.isfinite(distance), jnp.maximum(-distance, 0.0), jnp.inf))
         return result[: layout.constraints], multiply_words(shared.code.outputs, atoms).whole
 
 

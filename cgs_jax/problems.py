@@ -13,7 +13,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -42,6 +42,10 @@ from cgs_jax.transitions import Transitions
 
 TABLE_SIZE = 4096
 """Entries of a seed table."""
+
+
+Collisions = Literal["after", "inside"]
+"""Where clearances are seen to: after the solver, where they reject, or inside it, as a row for the nearest pair of each."""
 
 
 class RobotTable(NamedTuple):
@@ -89,6 +93,8 @@ class Problem:
     """(floating robot, switch) to the pose of its base as a product."""
     params: Params
     exact: Exact
+    collisions: Collisions = "after"
+    """Whether clearances are checked after the solver, or kept inside it."""
     source: tuple[str, int] | None = None
     """Path of the task file and instance, if `load_problem` makes the same problem of them."""
     samplers: tuple[OwnSampler, ...] = ()
@@ -129,6 +135,15 @@ def load_problem(name_or_path: str | Path, instance: int = 0) -> Problem:
 def build_problem(scene: Scene) -> Problem:
     """The problem of a loaded scene."""
     return _Builder(scene).build()
+
+
+def with_collisions(problem: Problem, collisions: Collisions) -> Problem:
+    """The same problem with its clearances checked after the solver, or kept inside it. Raises InputError for neither."""
+    if collisions not in ("after", "inside"):
+        raise InputError(f"collisions are seen to '{collisions}', expected one of: after, inside")
+    if collisions == problem.collisions:
+        return problem
+    return dataclasses.replace(problem, collisions=collisions, operators={})
 
 
 class _Builder:

@@ -187,6 +187,7 @@ class Recorder:
             "pools": self.settings.pools,
             "workers": self.settings.workers,
             "deterministic": self.settings.deterministic,
+            "collisions": self.settings.collisions,
             "transitions": {"complete": transitions.complete_count, "pruned": transitions.pruned_count()},
         }
 

@@ -27,7 +27,7 @@ from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
 from cgs_jax.operators import Operator, operator_of
-from cgs_jax.problems import Problem
+from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.transitions import Transition
 from cgs_jax.uct import Chooser
 from cgs_jax.worker import Setup, Worker
@@ -196,6 +196,8 @@ class SamplerSettings:
     """Same seed, same stream of samples: decisions use counted work in place of measured time."""
     solver: Settings = Settings()
     """Settings of the projection."""
+    collisions: Collisions = "after"
+    """Where clearances are seen to: "after" the solver, where they reject, or "inside" it, as a row for the nearest pair."""
 
 
 class _Pace:
@@ -302,11 +304,12 @@ class Sampler:
         settings: SamplerSettings | None = None,
         tolerances: Tolerances | None = None,
     ) -> None:
-        self.problem, self.chooser, self.settings = problem, chooser, settings or SamplerSettings()
+        self.chooser, self.settings = chooser, settings or SamplerSettings()
         s = self.settings
-        self._batch_settings = BatchSettings(s.batch_size, s.lanes, s.solver, counted_time=s.deterministic)
+        self.problem = with_collisions(problem, s.collisions)
+        self._batch_settings = BatchSettings(s.batch_size, s.lanes, s.solver, s.deterministic, s.collisions)
         self._seed, self._tolerances = seed, tolerances
-        self._runner = BatchRunner(problem, seed, self._batch_settings, tolerances)
+        self._runner = BatchRunner(self.problem, seed, self._batch_settings, tolerances)
         self.auditor = self._runner.auditor
         self._pools: dict[History, Pool] = {}
         self._waiting: dict[History, Pool] = {}

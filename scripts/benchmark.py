@@ -1,13 +1,13 @@
 """Measure how fast the samplers are on this machine, and compare results.
 
-    python scripts/benchmark.py                                   everything but `options` and the peer; about 25 minutes
+    python scripts/benchmark.py                                   all but `options`, `variants` and the peer; about 25 minutes
     python scripts/benchmark.py throughput --scenes handover --instances 0-3 --window 4,8
     python scripts/benchmark.py --peer komo [--python PATH]       both programs in turn on the peer's scenes
     python scripts/benchmark.py throughput --against old.json     measure, then compare: exit status 1 if slower
     python scripts/benchmark.py --results new.json --against old.json        compare only
 
-Parts: throughput, operators, start, scaling, utilisation, options. Prints tables and writes one JSON file with the machine,
-versions, date and the load average before and after each part. `docs/performance.md` says what each number means.
+Parts: throughput, operators, start, scaling, utilisation, options, variants. Prints tables and writes one JSON file with the
+machine, versions, date and the load average before and after each part. `docs/performance.md` says what each number means.
 
 Exit status: 0; 1 when a ratio to `--against` is below the threshold; 2 for bad input.
 """
@@ -858,6 +858,73 @@ def options(given: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
+VARIANT_INSTANCES = {"pick_place": (0, 6), "handover": (0, 6)}
+"""Instances of `variants`: the open one and a cluttered one."""
+
+
+def variants(given: argparse.Namespace) -> dict[str, Any]:
+    """Clearances checked after the solver or kept inside it, in turn, on one fixed sequence of each scene."""
+    from cgs_jax import SamplerSettings, load_problem
+
+    settings = {name: SamplerSettings(collisions=name) for name in ("after", "inside")}
+    report: dict[str, Any] = {"seconds": given.seconds, "rounds": given.rounds, "sequence": "expert3", "scenes": {}}
+    for scene in (name for name in given.scenes if name in VARIANT_INSTANCES):
+        instances = {}
+        for instance in VARIANT_INSTANCES[scene]:
+            problem = load_problem(scene, instance)
+            compiled = {name: warm_up(problem, "expert3", chosen)["all"] for name, chosen in settings.items()}
+            runs: dict[str, list[Measured]] = {name: [] for name in settings}
+            for i in range(given.rounds):
+                for name, chosen in settings.items():
+                    runs[name].append(measure(problem, fitting_window(given.seconds), "expert3", given.seed + i, chosen))
+            rows = {name: variant_row(measured) | {"warm_up_seconds": compiled[name]} for name, measured in runs.items()}
+            instances[str(instance)] = {
+                "title": problem.scene.task.instances[instance].title,
+                "variants": rows,
+                "inside_over_after": rows["inside"]["rate"] / rows["after"]["rate"] if rows["after"]["rate"] else None,
+            }
+        report["scenes"][scene] = instances
+    return report
+
+
+def variant_row(runs: Sequence[Measured]) -> dict[str, Any]:
+    """Medians over the rounds of the rate and, per operator, of success per try, iterations and time per attempt."""
+
+    def median(name: str, entry: str) -> float:
+        return statistics.median(getattr(run.record.operators[name], entry) for run in runs)
+
+    operators = {}
+    for name in runs[0].record.operators:
+        tasks = median(name, "tasks")
+        operators[name] = {
+            "success_per_try": statistics.median(run.record.operators[name].success_rate for run in runs),
+            "rows_solved_per_try": median(name, "proposed") / max(tasks, 1),
+            "iterations_per_try": median(name, "iterations") / max(tasks, 1),
+            "microseconds_per_try": 1e6 * median(name, "device_seconds") / max(tasks, 1),
+        }
+    rates = [run.rate for run in runs]
+    return {"rate": statistics.median(rates), "rates": rates, "operators": operators}
+
+
+def variants_tables(report: Mapping[str, Any]) -> list[Table]:
+    """Rates and their ratio; what each operator costs and yields in either variant."""
+    rates = new_table("Collision rows: samples per second", ["scene", "instance", "after", "inside", "inside / after"])
+    columns = ["operator", "scene", "variant", "success", "iterations", "us per try", "us per success"]
+    operators = new_table("Collision rows: operators", columns)
+    for scene, instances in report["scenes"].items():
+        for instance, entry in instances.items():
+            rows = entry["variants"]
+            numbers = (rows["after"]["rate"], rows["inside"]["rate"], entry["inside_over_after"])
+            rates.add_row(scene, f"{instance} {entry['title']}", *map(number, numbers))
+            for variant, row in rows.items():
+                for name, told in row["operators"].items():
+                    success, each = told["success_per_try"], told["microseconds_per_try"]
+                    numbers = (f"{success:.3f}", f"{told['iterations_per_try']:.1f}", f"{each:.1f}")
+                    per_success = number(each / success if success else None)
+                    operators.add_row(name, f"{scene} {instance}", variant, *numbers, per_success)
+    return [rates, operators]
+
+
 def some(samples: Any, count: int, seed: int) -> Any:
     """That many of the samples, at random."""
     return samples.select(np.random.default_rng(seed).permutation(len(samples))[:count])
@@ -1100,6 +1167,7 @@ PARTS: dict[str, tuple[Callable[[argparse.Namespace], dict[str, Any]], Callable[
     "scaling": (scaling, scaling_tables),
     "utilisation": (utilisation, utilisation_tables),
     "options": (options, options_tables),
+    "variants": (variants, variants_tables),
     "komo": (komo, komo_tables),
 }
 
@@ -1199,9 +1267,11 @@ def parse() -> argparse.ArgumentParser:
         "--window", type=window_in, default=(10.0, 20.0), metavar="A,B", help="seconds of sampling that count (default 10,20)"
     )
     parser.add_argument(
-        "--seconds", type=float, default=6.0, help="of one measurement in scaling and options, and of the peer (default 6)"
+        "--seconds", type=float, default=6.0, help="of one measurement in scaling, options, variants, the peer (default 6)"
     )
-    parser.add_argument("--rounds", type=int, default=3, help="warm starts, options' seeds, turns with the peer (default 3)")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="warm starts, seeds of options and variants, turns with the peer (default 3)"
+    )
     parser.add_argument("--method", default="tree", help="method of throughput, operators, utilisation, peer (default tree)")
     sizes = [256, 512, 1024, 2048, 4096]
     parser.add_argument("--batches", type=numbers_in, default=sizes, help="batch sizes of scaling, options")

@@ -95,6 +95,12 @@ def parser() -> Parser:
         help="reading of the paper's cost: per finished sample (rate, default) or per rollout",
     )
     search.add_argument("--tries", type=int, metavar="N", help="tries of a partial sample per operator; 1 as in the paper")
+    search.add_argument(
+        "--collisions",
+        choices=("after", "inside"),
+        default="after",
+        help="check clearances after the solver (default), or keep them inside it (slower, for narrow scenes)",
+    )
     search.add_argument("--no-pools", action="store_true", help="drop the whole partial sample on a failure, as in the paper")
 
     output = parse.add_argument_group("output")
@@ -256,6 +262,7 @@ def run(options: argparse.Namespace) -> int:
         settings = cgs_jax.SamplerSettings(
             pools=not options.no_pools,
             deterministic=options.deterministic,
+            collisions=options.collisions,
             **{name: getattr(options, name) for name in ("batch_size", "tries") if getattr(options, name) is not None},
         )
         sampling = cgs_jax.Run(

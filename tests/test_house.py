@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "kinematics": {"errors", "poses"},
     "constraints": {"poses"},
     "collisions": {"constraints", "distance", "kinematics", "poses"},
-    "plans": {"augmented_lagrangian", "constraints", "kinematics", "poses"},
+    "plans": {"augmented_lagrangian", "collisions", "constraints", "distance", "kinematics", "poses"},
     "seeds": {"constraints", "plans", "poses"},
     "costs": {"augmented_lagrangian", "plans", "poses"},
     # scenes, samples and what reads them
