@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from cgs_jax import augmented_lagrangian as al
+from cgs_jax.audit import Tolerances
 from cgs_jax.costs import descend
 from cgs_jax.coverage import CoverageGain
 from cgs_jax.errors import InputError
@@ -103,6 +104,7 @@ class RunOptions(TypedDict, total=False):
     settings: how the run is scheduled.
     prior: trees of earlier runs, for the method "tree-warm".
     c_uct, reward: weight of exploration and reading of the paper's cost, see `make_chooser`.
+    tolerances: what the audit accepts in place of its default; the solver's own tolerance is in `settings`.
     """
 
     method: str
@@ -111,6 +113,7 @@ class RunOptions(TypedDict, total=False):
     prior: Sequence[Mapping[str, Any]]
     c_uct: float | None
     reward: Literal["rate", "rollout"]
+    tolerances: Tolerances | None
 
 
 class Run:
@@ -125,12 +128,13 @@ class Run:
         prior: Sequence[Mapping[str, Any]] = (),
         c_uct: float | None = None,
         reward: Literal["rate", "rollout"] = "rate",
+        tolerances: Tolerances | None = None,
     ) -> None:
         """The options are told at `RunOptions`."""
         settings = settings or SamplerSettings()
         chooser = make_chooser(problem, method, seed, prior, c_uct, reward, settings.pools)
         self.problem = problem
-        self.sampler = Sampler(problem, chooser, seed, settings)
+        self.sampler = Sampler(problem, chooser, seed, settings, tolerances)
         self.record = Recorder(problem, chooser, method, seed, settings, self.sampler.auditor)
 
     def events(
@@ -171,8 +175,8 @@ def sample(
 ) -> SampleSet:
     """Samples a problem until the first of its budgets is used up (`Run.events`).
 
-    Every sample passed the double-precision audit. The result may be empty. Raises InputError for a wrong method or budget.
-    Paper, Algorithm 1.
+    Every sample passed the double-precision audit at `tolerances`. The result may be empty. Raises InputError for a wrong
+    method or budget. Paper, Algorithm 1.
     """
     run = Run(problem, **options)
     for _ in run.events(time_budget, num_samples, coverage_gain):

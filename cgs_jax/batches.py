@@ -140,6 +140,24 @@ class BatchRunner:
         return [future for futures in self._requested.values() for future in futures]
 
     def _programs(self, operator: Operator) -> list[Future]:
+        return [programs.request(*recipe) for recipe in self._recipes(operator)]
+
+    def _call(self, operator: Operator, position: int, *arguments: Any) -> Any:
+        """Runs a program of an operator; one that was compiled elsewhere and fails is compiled here, once."""
+        program = self.request(operator)[position].result()
+        try:
+            return program(*arguments)
+        except Exception:
+            if not program.loaded:
+                raise
+        replaced = programs.request_anew(*self._recipes(operator)[position])
+        with self._lock:
+            self._requested[operator.identity] = list(self._requested[operator.identity])
+            self._requested[operator.identity][position] = replaced
+        return replaced.result()(*arguments)
+
+    def _recipes(self, operator: Operator) -> list[tuple]:
+        """Arguments of `programs.request` for each program of an operator."""
         s, batch = self.settings, self.settings.batch_size
         scalar = np.zeros((), np.int32)
         layout = operator.plan.layout
@@ -151,13 +169,13 @@ class BatchRunner:
             name += f", {', '.join(operator.inside)}"
         own = layout.functions or layout.samplers
         key = None if own else f"propose {layout} {s.solver} {s.lanes}"
-        futures = [programs.request(name, propose_program(layout, s.solver, s.lanes), arguments, key)]
+        recipes: list[tuple] = [(name, propose_program(layout, s.solver, s.lanes), arguments, key)]
         for clear in operator.clears:
             poses = np.zeros((batch, len(clear.poses), 7), np.float32)
             arguments = (scalar, poses, self._blank_configurations(clear.configurations), self._numbers_of(clear))
             name, function = f"clearance {clear.constraint}", clearance_program(clear.layout)
-            futures.append(programs.request(name, function, arguments, f"clearance {clear.layout}"))
-        return futures
+            recipes.append((name, function, arguments, f"clearance {clear.layout}"))
+        return recipes
 
     def _blank_configurations(self, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
         dofs = [self.problem.dofs[name] or 0 for name in names]
@@ -178,7 +196,8 @@ class BatchRunner:
     def run(self, batch: Batch) -> Outcome:
         """Runs one batch and, where it completes samples, audits them. Waits for its programs."""
         operator, problem = operator_of(self.problem, batch.transition), self.problem
-        futures = [future.result() for future in self.request(operator)]
+        for future in self.request(operator):
+            future.result()
         began = time.perf_counter()
         count, room = batch.tasks, self.settings.batch_size
         padded = {name: _fill(batch.conditions[name], room) for name in operator.condition}
@@ -186,7 +205,8 @@ class BatchRunner:
         of_function = tuple(padded[name] for name in operator.plan.given_configurations)
         key, numbers = self._key_of(operator), self._numbers_of(operator)
         device = -time.perf_counter()
-        result = futures[0](key, np.uint32(batch.first_task % 2**32), np.int32(count), given, of_function, numbers)
+        first = np.uint32(batch.first_task % 2**32)
+        result = self._call(operator, 0, key, first, np.int32(count), given, of_function, numbers)
         device += time.perf_counter()
         rows_hold = np.asarray(result.feasible)[:count]
         iterations = int(np.asarray(result.iterations)[:count].sum())
@@ -200,14 +220,14 @@ class BatchRunner:
         proposed = len(success)
         new = {name: np.asarray(value)[success] for name, value in operator.named(result).items()}
         values = {name: value[success] for name, value in batch.conditions.items()} | new
-        for clear, program in zip(operator.clears, futures[1:], strict=True):
+        for position, clear in enumerate(operator.clears, start=1):
             if not len(success):
                 break
             padded = {name: _fill(values[name], room) for name in clear.reads}
             poses = gather_poses(clear, problem.params, padded, room)
             q = tuple(padded[name] for name in clear.configurations)
             device -= time.perf_counter()
-            distance = program(np.int32(len(success)), poses, q, self._numbers_of(clear))
+            distance = self._call(operator, position, np.int32(len(success)), poses, q, self._numbers_of(clear))
             device += time.perf_counter()
             clears = np.asarray(distance)[: len(success)] >= -PENETRATION
             if not clears.all():

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
+import jaxlib
 from jax.experimental import serialize_executable
 
 CACHE_BYTES = 512 * 2**20
@@ -51,17 +52,44 @@ def end_process(status: int) -> NoReturn:
     os._exit(status)
 
 
-@functools.cache
-def _environment() -> str:
-    """What a compiled program depends on besides its key: this package's text, jax, and the processor."""
+def _digest_of_sources() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+SOURCES = _digest_of_sources()
+"""Digest of this package's text as it was when this process imported it."""
+
+VARIABLES = ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS")
+"""Variables of the environment that change what XLA generates."""
+
+OPTIONS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_disable_most_optimizations",
+    "jax_debug_nans",
+)
+"""Settings of JAX that change what is traced or generated."""
+
+
+@functools.cache
+def _machine() -> str:
     cpu = Path("/proc/cpuinfo")
     features = cpu.read_text().split("\n\n")[0] if cpu.exists() else platform.processor()
-    digest.update("\n".join(line for line in features.splitlines() if line.startswith(("flags", "model name"))).encode())
-    digest.update(f"{jax.__version__} {jax.default_backend()} {platform.machine()} {platform.python_version()}".encode())
-    return digest.hexdigest()
+    lines = [line for line in features.splitlines() if line.startswith(("flags", "model name"))]
+    return "\n".join([*lines, platform.machine()])
+
+
+def _environment() -> str:
+    """What a compiled program depends on besides its key: this package's text, jax and its settings, and the machine."""
+    parts = [SOURCES, _machine(), jax.__version__, jaxlib.__version__, jax.default_backend(), platform.python_version()]
+    parts += [f"{name}={os.environ.get(name)}" for name in VARIABLES]
+    parts += [f"{name}={jax.config.values.get(name)}" for name in OPTIONS]
+    return "\n".join(parts)
 
 
 def _jax_caches() -> bool:
@@ -113,6 +141,8 @@ class Program:
         self.name, self.seconds = name, seconds
         self.reported = False
         """Whether a run has counted its compile seconds."""
+        self.loaded = portable is not None
+        """Whether it was compiled by another process: it may be damaged, or not fit this one."""
         self._executable = executable
         self._portable = portable
 
@@ -158,6 +188,19 @@ def request(name: str, function: Callable, arguments: tuple, key: str | None = N
             shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), arguments)
             _compiled[known] = _pool.submit(_make, name, function, shapes, key)
         return _compiled[known]
+
+
+def request_anew(name: str, function: Callable, arguments: tuple, key: str | None = None) -> Future[Program]:
+    """Like `request`, but the program is compiled here, in place of one that was loaded and failed."""
+    path = _entry(key, arguments)
+    if path is not None:
+        path.unlink(missing_ok=True)
+    with _lock:
+        known = _compiled.get((function, _signature(arguments)))
+        if known is not None and not (known.done() and (known.exception() or known.result().loaded)):
+            return known
+        _compiled.pop((function, _signature(arguments)), None)
+    return request(name, function, arguments, key)
 
 
 def all_requested() -> list[Future[Program]]:

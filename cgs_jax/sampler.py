@@ -26,6 +26,7 @@ import numpy as np
 from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
+from cgs_jax.errors import InputError
 from cgs_jax.operators import Operator, operator_of
 from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.transitions import Transition
@@ -244,6 +245,7 @@ class _Crew:
         self._lock = threading.Lock()
         self._wanted, self._arrived = workers, 0
         self._local = runner
+        self._refusal: InputError | None = None
         self.size = 0
         """Batches that can run at once now."""
         self._workers: list[Worker] = []
@@ -265,14 +267,19 @@ class _Crew:
         self._workers.append(worker)
 
         def arrive() -> None:
-            if worker.await_ready():
-                self._arrived += 1
-                self._seat(worker)
+            try:
+                if worker.await_ready():
+                    self._arrived += 1
+                    self._seat(worker)
+            except InputError as error:
+                self._refusal = error
 
         threading.Thread(target=arrive, daemon=True).start()
 
     def run(self, batch: Batch, look: bool) -> Outcome:
         """Runs a batch on whoever is free; a first look at an operator here, where its programs are loaded already."""
+        if self._refusal is not None:
+            raise self._refusal
         if look:
             return self._local.run(batch)
         member = self._free.get()

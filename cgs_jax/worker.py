@@ -19,8 +19,9 @@ from typing import Any, BinaryIO
 
 from cgs_jax.audit import Tolerances
 from cgs_jax.batches import Batch, BatchRunner, BatchSettings, Outcome
+from cgs_jax.errors import InputError
 from cgs_jax.problems import load_problem
-from cgs_jax.programs import Program, load_portable
+from cgs_jax.programs import SOURCES, Program, load_portable
 
 ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of a process whose programs run on one thread."""
@@ -28,7 +29,7 @@ ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 @dataclass(frozen=True)
 class Setup:
-    """First message: what the worker needs to make its runner."""
+    """Second message, after the digest of the sources: what the worker needs to make its runner."""
 
     scene: str
     instance: int
@@ -57,6 +58,7 @@ class Worker:
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
+        self._send(SOURCES)
         self._send(setup)
         self._installed: set[int] = set()
         self._sent: set[int] = set()
@@ -74,11 +76,13 @@ class Worker:
         self._send(Install(identity, numbers, missing))
 
     def await_ready(self) -> bool:
-        """Waits until it can take batches; False when it ended before."""
+        """Waits until it can take batches; False when it ended before. Raises InputError when it runs other sources."""
         try:
-            pickle.load(self._pipe_from())
+            answer = pickle.load(self._pipe_from())
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
             return False
+        if isinstance(answer, InputError):
+            raise answer
         return True
 
     def _pipe_from(self) -> BinaryIO:
@@ -121,11 +125,20 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         pickle.dump(message, sink, protocol=pickle.HIGHEST_PROTOCOL)
         sink.flush()
 
+    # Plain text comes first: messages of other sources may have other fields.
+    if pickle.load(source) != SOURCES:
+        answer(
+            InputError(
+                "a worker process found other sources of cgs_jax than this process had loaded, expected the same: "
+                "the files were edited meanwhile; start again"
+            )
+        )
+        return
     setup: Setup = pickle.load(source)
     problem = load_problem(setup.scene, setup.instance)
     runner = BatchRunner(problem, setup.seed, setup.settings, setup.tolerances)
     answer("ready")
-    loaded: dict[int, Program] = {}
+    loaded: dict[int, Program | None] = {}
     while True:
         try:
             message: Install | Batch = pickle.load(source)
@@ -133,12 +146,22 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             return
         try:
             if isinstance(message, Install):
-                loaded |= {number: load_portable(data) for number, data in message.programs.items()}
-                runner.install(message.identity, [loaded[number] for number in message.numbers])
+                loaded |= {number: _loaded(data) for number, data in message.programs.items()}
+                received = [loaded[number] for number in message.numbers]
+                if all(received):  # else the runner compiles its own
+                    runner.install(message.identity, [program for program in received if program])
             else:
                 answer(runner.run(message))
         except Exception as error:  # noqa: BLE001 - sent to the process that asked
             answer(error)
+
+
+def _loaded(data: bytes) -> Program | None:
+    """A received program; None where it cannot be loaded here."""
+    try:
+        return load_portable(data)
+    except Exception:  # noqa: BLE001 - whatever is wrong with it, it can be compiled here
+        return None
 
 
 def main() -> None:

@@ -64,8 +64,8 @@ MAY_IMPORT = {
     # the porch
     "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
     "api": {
-        "errors", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record", "sampler",
-        "samples", "transitions", "uct",
+        "errors", "audit", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record",
+        "sampler", "samples", "transitions", "uct",
     },
 }  # fmt: skip
 

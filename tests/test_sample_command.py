@@ -144,7 +144,10 @@ def test_deterministic_repeats_a_run_whatever_the_process(tmp_path):
     assert command.main([*options, "--num-samples", "300", "--out", str(tmp_path / "a"), "--quiet"]) == 0
     assert start(*options, "--num-samples", 200, "--out", tmp_path / "b").returncode == 0
     a, b = SampleSet.load(tmp_path / "a"), SampleSet.load(tmp_path / "b")
+    assert a.meta["workers"] == b.meta["workers"] == 2
     np.testing.assert_array_equal(a.qpos[:200], b.qpos)
+    for name, values in b.variables.items():
+        assert a[name][:200].tobytes() == values.tobytes(), name
     assert [a.sequences[i] for i in a.sequence[:200]] == [b.sequences[i] for i in b.sequence]
 
     options[options.index("3")] = "4"

@@ -1,0 +1,132 @@
+"""Compiled programs: what belongs to their key, and what happens to one that is damaged or foreign."""
+
+import io
+import pickle
+
+import jax
+import numpy as np
+import pytest
+from loaded import problem
+
+import cgs_jax
+from cgs_jax import programs, worker
+from cgs_jax.api import conditional
+from cgs_jax.batches import Batch, BatchRunner, BatchSettings
+from cgs_jax.errors import InputError
+from cgs_jax.operators import operator_of
+from cgs_jax.sampler import SamplerSettings
+
+SETTINGS = SamplerSettings()
+SMALL = BatchSettings(64, 32, SETTINGS.solver)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(programs, "_folder", tmp_path)
+    monkeypatch.setattr(programs, "_compiled", {})
+    return tmp_path
+
+
+def grasps():
+    at = problem("pick_place")
+    return at, Batch(conditional(at, (), ("t",)), {}, 64, 0, completes=False)
+
+
+def foreign():
+    """A sound executable of another function."""
+    compiled = jax.jit(lambda x: x + 1.0).lower(np.zeros(3, np.float32)).compile()
+    return programs.Program("foreign", compiled, 0.0).portable
+
+
+def test_a_foreign_entry_of_the_cache_is_replaced(folder):
+    at, batch = grasps()
+    wanted = BatchRunner(at, 0, SMALL).run(batch)
+    (entry,) = folder.glob("*.program")
+    sound = len(entry.read_bytes())
+    entry.write_bytes(foreign())
+    programs._compiled.clear()
+    found = BatchRunner(at, 0, SMALL).run(batch)
+    np.testing.assert_array_equal(found.values["t"], wanted.values["t"])
+    assert len(wanted.values["t"]) > 0 and abs(len(entry.read_bytes()) - sound) < 0.1 * sound
+
+
+def test_a_damaged_entry_of_the_cache_is_replaced(folder):
+    at, batch = grasps()
+    wanted = BatchRunner(at, 0, SMALL).run(batch)
+    (entry,) = folder.glob("*.program")
+    data = entry.read_bytes()
+    entry.write_bytes(data[: len(data) // 2])
+    programs._compiled.clear()
+    np.testing.assert_array_equal(BatchRunner(at, 0, SMALL).run(batch).values["t"], wanted.values["t"])
+
+
+def test_a_received_program_that_fails_is_compiled_once(folder):
+    at, batch = grasps()
+    runner = BatchRunner(at, 0, SMALL)
+    wanted = runner.run(batch)
+    received = programs.load_portable(foreign())
+    other = BatchRunner(at, 0, SMALL)
+    other.install(operator_of(at, batch.transition).identity, [received])
+    np.testing.assert_array_equal(other.run(batch).values["t"], wanted.values["t"])
+    assert other.requested()[0].result() is not received
+
+
+def test_a_program_of_our_own_that_fails_ends_the_run(folder):
+    at, batch = grasps()
+    runner = BatchRunner(at, 0, SMALL)
+    runner.run(batch)
+
+    def fail(*arguments):
+        raise RuntimeError("out of memory")
+
+    runner.requested()[0].result()._executable = fail
+    with pytest.raises(RuntimeError, match="out of memory"):
+        runner.run(batch)
+
+
+@pytest.mark.parametrize("name", ["XLA_FLAGS", "NPROC"])
+def test_what_changes_the_generated_code_belongs_to_the_key(folder, monkeypatch, name):
+    shapes = (jax.ShapeDtypeStruct((3,), np.float32),)
+    monkeypatch.delenv(name, raising=False)
+    before = programs._entry("any", shapes)
+    monkeypatch.setenv(name, "1")
+    assert programs._entry("any", shapes) != before
+    monkeypatch.delenv(name)
+    assert programs._entry("any", shapes) == before
+    with jax.debug_nans(True):
+        assert programs._entry("any", shapes) != before
+
+
+# ------------------------------------------------------------------ workers
+
+
+def told(*messages):
+    """What a worker answers to these messages."""
+    sink = io.BytesIO()
+    worker.serve(io.BytesIO(b"".join(map(pickle.dumps, messages))), sink)
+    sink.seek(0)
+    answers = []
+    while sink.tell() < len(sink.getvalue()):
+        answers.append(pickle.load(sink))
+    return answers
+
+
+def test_a_worker_with_other_sources_refuses_in_one_line():
+    (answer,) = told("another digest", "messages that it must not read")
+    assert isinstance(answer, InputError)
+    assert "other sources" in str(answer) and "\n" not in str(answer)
+
+
+def test_a_refusal_ends_the_run(monkeypatch):
+    at = cgs_jax.load_problem("pick_place")
+    monkeypatch.setattr(worker, "SOURCES", "another digest")
+    with pytest.raises(InputError, match="other sources"):
+        cgs_jax.sample(at, time_budget=30.0, method="expert3")
+
+
+def test_a_worker_compiles_what_it_cannot_load():
+    at, batch = grasps()
+    setup = worker.Setup(*at.source, 0, SMALL, None)
+    number = operator_of(at, batch.transition).identity
+    answers = told(programs.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}), batch)
+    assert answers[0] == "ready" and len(answers) == 2 and answers[1].success.all()
