@@ -533,7 +533,8 @@ class Sampler:
     def _affordable(self, operator: Operator) -> int:
         """Tasks of a batch that takes about `BATCH_SECONDS`: a look at a slow operator must not cost more than at others."""
         affordable = BATCH_SECONDS / self._pace.seconds_per_task(operator)
-        return int(min(self.settings.batch_size, max(affordable, 32)))
+        # Fewer tasks than lanes take as long, and would make the operator look slower still.
+        return int(min(self.settings.batch_size, max(affordable, self.settings.lanes)))
 
     def _pool(self, history: History) -> Pool:
         return self._pools.setdefault(history, Pool())
