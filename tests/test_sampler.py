@@ -7,6 +7,7 @@ import pytest
 from loaded import problem
 
 from cgs_jax.api import make_chooser
+from cgs_jax.errors import InputError
 from cgs_jax.sampler import Finished, Found, Pool, Ran, Sampler, SamplerSettings, Started
 
 SETTINGS = SamplerSettings(batch_size=128, lanes=32, workers=1, deterministic=True)
@@ -100,6 +101,17 @@ def test_samples_are_neither_piled_on_limits_nor_on_each_other(fixed):
         assert at_limit.mean() < 0.05
         near = [np.abs(a - b).max() < 1e-2 for a, b in itertools.combinations(q, 2)]
         assert np.mean(near) < 0.01
+
+
+def test_clearances_may_be_kept_inside_the_solver():
+    events = run(collisions="inside", number=30)
+    assert sum(len(event.qpos) for event in of(Found, events)) == 30
+    assert sum(event.rejected for event in of(Found, events)) == 0
+    # Nothing is checked afterwards; a collision is one of the causes for which a projection fails.
+    assert all(event.proposed == event.cleared for event in of(Ran, events))
+    assert any(name.startswith("Collision") for event in of(Ran, events) for name in event.failures)
+    with pytest.raises(InputError, match="expected one of: after, inside"):
+        sampler(collisions="never")
 
 
 def test_stop_ends_the_run_after_the_batches_in_flight():
