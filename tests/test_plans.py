@@ -9,7 +9,7 @@ from loaded import SCENES, problem, product, random_values
 from cgs_jax import api
 from cgs_jax import augmented_lagrangian as al
 from cgs_jax.constraints import PoseRows
-from cgs_jax.operators import PENETRATION, clearance, gather_given, gather_poses, operator_of, propose_program
+from cgs_jax.operators import gather_given, operator_of, propose_program
 from cgs_jax.plans import PlanSystem
 from cgs_jax.poses import Pose, from_vector
 from cgs_jax.problems import with_collisions
@@ -154,48 +154,26 @@ def drawn_rows(at, given, new, lanes):
     return operator, PlanSystem(layout), x, (tasks, numbers.shared)
 
 
-@pytest.mark.parametrize(
-    ("given", "new", "inside"),
-    [
-        ((), ("p", "q_b2", "t_b"), ("Position(p)", "Kin(q_b2,p,t_b)", "Collision(q_b2)")),
-        (("q_a2", "t_b", "p"), ("q_b2",), ("Kin(q_b2,p,t_b)", "Collision(q_b2)", "Collision(q_a2,q_b2)")),
-    ],
-)
-def test_rows_of_clearances_change_as_their_derivative_says(given, new, inside):
+def test_rows_of_clearances_change_as_their_derivative_says():
     at = with_collisions(problem("handover"), "inside")
-    operator, system, x, data = drawn_rows(at, given, new, 64)
+    inside = ("Position(p)", "Kin(q_b2,p,t_b)", "Collision(q_b2)", "Collision(q_a2,q_b2)")
+    operator, system, x, data = drawn_rows(at, ("q_a2",), ("p", "q_b2", "t_b"), 64)
+    # Away from the seed's upright box: its faces are parallel to the table's, where distances have kinks.
+    x = system.retract(x, 0.3 * jax.random.normal(jax.random.key(1), (system.layout.unknowns, 64)))
     assert operator.inside == inside and not operator.clears
-    rows = jax.jit(lambda x: system.rows(x, data), compiler_options={"xla_backend_optimization_level": 0})
-    at_x, step = rows(x), 5e-4
-    count = len(inside)
+    count, step = len(inside), 5e-4
+
+    def last_rows(x, move):
+        rows = system.rows(system.retract(x, move), data)
+        return al.Rows(*(part[-count:] for part in rows))
+
+    last_rows = jax.jit(last_rows, compiler_options={"xla_backend_optimization_level": 0})
+    at_x = last_rows(x, jnp.zeros((system.layout.unknowns, 64)))
     for i in range(system.layout.unknowns):
-        move = jnp.zeros((system.layout.unknowns, 64)).at[i].set(step)
-        ahead, behind = (rows(system.retract(x, sign * move)).value[-count:] for sign in (1.0, -1.0))
-        error = np.abs((ahead - behind) / (2 * step) - at_x.jacobian[-count:, i])
+        move = np.zeros((system.layout.unknowns, 64), np.float32)
+        move[i] = step
+        ahead, behind = (np.asarray(last_rows(x, sign * move).value) for sign in (1.0, -1.0))
+        error = np.abs((ahead - behind) / (2 * step) - at_x.jacobian[:, i])
         # Where another pair becomes the nearest the distance has a kink.
         assert np.median(error) < 1e-3 and (error < 5e-3).mean() > 0.9
-    assert np.abs(at_x.jacobian[-count:]).max() > 0.1
-    violation, _ = system.violations(x, data)
-    for row, slot in zip(at_x.value[-count:], system.layout.clearances, strict=True):
-        if operator.measured[slot.constraint].startswith("Collision"):  # the others have rows of poses too
-            np.testing.assert_allclose(violation[slot.constraint], np.maximum(-row, 0.0), atol=1e-5)
-
-
-def test_what_the_rows_keep_apart_the_check_afterwards_accepts():
-    at, lanes = problem("pick_place"), 128
-    inside = with_collisions(at, "inside")
-    solve = {
-        name: jax.jit(lambda key, params, which=which: api.operator(which, (), ("q1", "t"))(key, {}, params, lanes))
-        for name, which in (("after", at), ("inside", inside))
-    }
-    shares = {}
-    for name, run in solve.items():
-        values, feasible = run(jax.random.key(0), at.params)
-        shares[name] = np.asarray(feasible).mean()
-    # Of the same seeds, many that end in penetration are moved out of it.
-    assert shares["inside"] > 1.3 * shares["after"] > 0.1
-    (clear,) = [c for c in operator_of(at, api.conditional(at, (), ("q1", "t"))).clears]
-    poses = gather_poses(clear, at.params, values, lanes)
-    measure = jax.jit(lambda p, q: clearance(clear.layout, lanes, p, q, clear.numbers(at.params)))
-    distance = measure(poses, tuple(values[name] for name in clear.configurations))
-    assert distance[np.asarray(feasible)].min() >= -PENETRATION
+    assert np.abs(at_x.jacobian).max() > 0.1

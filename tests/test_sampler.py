@@ -104,12 +104,15 @@ def test_samples_are_neither_piled_on_limits_nor_on_each_other(fixed):
 
 
 def test_clearances_may_be_kept_inside_the_solver():
-    events = run(collisions="inside", number=30)
+    events = run("expert3", collisions="inside", number=30)
     assert sum(len(event.qpos) for event in of(Found, events)) == 30
     assert sum(event.rejected for event in of(Found, events)) == 0
     # Nothing is checked afterwards; a collision is one of the causes for which a projection fails.
     assert all(event.proposed == event.cleared for event in of(Ran, events))
     assert any(name.startswith("Collision") for event in of(Ran, events) for name in event.failures)
+    first = [event for event in of(Ran, events) if event.position == 0]
+    # Checked afterwards, a third of these seeds succeeds.
+    assert sum(event.cleared for event in first) > 0.45 * sum(event.tasks for event in first)
     with pytest.raises(InputError, match="expected one of: after, inside"):
         sampler(collisions="never")
 
