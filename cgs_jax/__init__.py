@@ -20,6 +20,7 @@ _HOMES = {
     "SamplerSettings": "sampler",
     "Tolerances": "audit",
     "available_scenes": "scene",
+    "check_problem": "check",
     "enable_disk_cache": "programs",
     "end_process": "programs",
     "load_problem": "problems",

@@ -3,9 +3,11 @@
     python scripts/sample.py --scene banana
     python scripts/sample.py --scene handover --instance 3 --time-budget 30 --out runs/mine
     python scripts/sample.py --scene handover --method "p; t_a; t_b; q_a1; q_a2; q_b2; q_b1"
+    python scripts/sample.py --scene handover --check
 
 Writes samples.npz, tree.json and run.json; while it runs, what it has found so far to samples.parts. Exit status: 0 with at
-least one sample (also after Ctrl-C), 3 with none (one line says which operator and constraint stopped it), 2 for bad input.
+least one sample (also after Ctrl-C), 3 with none (one line says which operator and constraint stopped it), 2 for bad input. With
+--check nothing is sampled: 0 when all is well, 2 with one line per fault.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
+import json
 import math
 import os
 import signal
@@ -30,12 +33,13 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from cgs_jax.check import ProblemCheck
     from cgs_jax.record import Recorder
     from cgs_jax.samples import SampleSet
     from cgs_jax.scene import Task
 
 TREES = ("tree", "tree-warm")
-WRITTEN = ("samples.npz", "tree.json", "run.json", "profile.json", "samples_sheet.png", "samples.gif")
+WRITTEN = ("samples.npz", "tree.json", "run.json", "profile.json", "samples_sheet.png", "samples.gif", "report.html")
 
 APPEND_SECONDS = 1.0
 """Sampling time from one part on disk to the next: what a killed run loses at most."""
@@ -57,6 +61,11 @@ def parser() -> Parser:
     )
     parse.add_argument("--scene", required=True, metavar="NAME", help="a scene that comes with the package, or a task file")
     parse.add_argument("--instance", type=int, default=0, metavar="N", help="instance of the scene, from 0 (default 0)")
+    parse.add_argument(
+        "--check",
+        action="store_true",
+        help="sample nothing: look for faults (reach, penetrations, rows, gradients, sequences) and draw graph.svg",
+    )
 
     budget = parse.add_argument_group("how long")
     budget.add_argument("--time-budget", type=float, default=10.0, metavar="S", help="seconds of sampling (default 10)")
@@ -110,6 +119,7 @@ def parser() -> Parser:
     output.add_argument("--json", action="store_true", help="print run.json, and nothing else, on standard output")
     output.add_argument("--quiet", action="store_true", help="print nothing but errors")
     output.add_argument("--profile", action="store_true", help="print and save (profile.json) where the time went")
+    output.add_argument("--report", action="store_true", help="write report.html, one page that needs no network")
     output.add_argument("--render", action="store_true", help="write a contact sheet and a GIF of diverse samples")
     output.add_argument("--view", action="store_true", help="show the samples in a web page at the end")
     output.add_argument("--no-cache", action="store_true", help="keep no compiled programs on disk")
@@ -142,6 +152,10 @@ def check_numbers(options: argparse.Namespace) -> None:
             raise InputError(f"--batch-size is '{options.batch_size}', expected a whole number or auto") from None
         if options.batch_size < 1:
             raise InputError(f"--batch-size is {options.batch_size}, expected at least 1")
+    if options.check:
+        for name in ("profile", "report", "render", "view", "diverse", "save_tree"):
+            if getattr(options, name):
+                raise InputError(f"--{name.replace('_', '-')} has no effect with --check, which samples nothing")
     if options.warm_start and options.method not in TREES:
         raise InputError(f"--warm-start has no effect on method '{options.method}', expected one of: {', '.join(TREES)}")
 
@@ -254,6 +268,8 @@ def run(options: argparse.Namespace) -> int:
     task = check_scene(options)
     check_viewers(options)
     folder = options.out if options.out is not None else Path("runs") / f"{task.name}-{options.instance}"
+    if options.check:
+        return check(options, folder)
     with LiveLine(not options.quiet) as line:
         if not options.no_cache:
             cgs_jax.enable_disk_cache()
@@ -276,6 +292,29 @@ def run(options: argparse.Namespace) -> int:
             line.enter_phase("writing")
             samples = write(sampling.record, options, folder)
     return report(sampling.record, samples, options, folder)
+
+
+def check(options: argparse.Namespace, folder: Path) -> int:
+    """Looks for faults without sampling, draws the graph, prints both; returns the exit status."""
+    from cgs_jax import diagram
+
+    with LiveLine(not options.quiet) as line, writable(folder):
+        problem = cgs_jax.load_problem(options.scene, options.instance)
+        line.enter_phase("checking")
+        prior = [cgs_jax.load_tree(path) for path in options.warm_start]
+        cgs_jax.make_chooser(problem, options.method, options.seed, prior)
+        found = cgs_jax.check_problem(problem, options.seed)
+        diagram.save(folder / "graph.svg", diagram.describe(problem.graph, problem.scene.task))
+    if options.json:
+        print(json.dumps(found.as_json(), indent=1))
+    elif not options.quiet:
+        console = make_console()
+        print_check(console, found)
+        console.print(f"\nGraph drawn in {folder / 'graph.svg'}", soft_wrap=True)
+    sys.stdout.flush()
+    for fault in found.faults:
+        print(f"sample.py: fault: {fault}", file=sys.stderr)
+    return 2 if found.faults else 0
 
 
 def drive(sampling: cgs_jax.Run, options: argparse.Namespace, line: LiveLine, folder: Path) -> None:
@@ -345,10 +384,7 @@ def report(record: Recorder, samples: SampleSet, options: argparse.Namespace, fo
     if options.json:
         print((folder / "run.json").read_text(encoding="utf-8"), end="")
     elif not options.quiet:
-        from rich.console import Console
-
-        # A pipe has no width of its own; what reads it can cut lines, but not join them.
-        console = Console(width=None if sys.stdout.isatty() else 140, highlight=False)
+        console = make_console()
         print_summary(console, record, samples)
         if options.profile:
             print_profile(console, record)
@@ -364,6 +400,13 @@ def report(record: Recorder, samples: SampleSet, options: argparse.Namespace, fo
         print(f"{len(samples)} samples at {page.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
         page.run()
     return 0
+
+
+def make_console() -> Console:
+    """Standard output. A pipe has no width of its own; what reads it can cut lines, but not join them."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 140, highlight=False)
 
 
 def table(*columns: str) -> Table:
@@ -452,6 +495,39 @@ def print_profile(console: Console, record: Recorder) -> None:
         programs.add_row(program["name"], f"{program['seconds']:.2f}")
     console.print()
     console.print(programs)
+
+
+def print_check(console: Console, found: ProblemCheck) -> None:
+    """What was looked at: names, constraints, reach, penetrations, the pruned graph and its sequences."""
+    robots = ", ".join(f"{name} ({joints} joints)" for name, joints in found.robots.items())
+    console.print(
+        f"[bold]{found.scene}[/] instance {found.instance}: {robots}; {', '.join(found.objects)}; "
+        f"switches {', '.join(found.switches)}",
+        soft_wrap=True,
+    )
+    constraints = table("constraint", "dofs", "equality rows", "inequality rows", "rank", "gradient off by")
+    for row in found.constraints:
+        rank, slope = ("-", "-") if row.rank is None else (str(row.rank), f"{row.slope_error:.0e}")
+        constraints.add_row(row.name, str(row.dof), str(row.equality_rows), str(row.inequality_rows), rank, slope)
+    constraints.add_section()
+    constraints.add_row("all together", str(found.dof), str(found.equality_rows), "", str(found.rank), "")
+    console.print()
+    console.print(constraints)
+    reaches = table("to be reached", "by", "distance m", "reach m", "nearest of the table m")
+    for reach in found.reaches:
+        numbers = (reach.distance, reach.reach, reach.gap)
+        reaches.add_row(reach.pose, f"{reach.robot}/{reach.frame}", *(f"{number:.2f}" for number in numbers))
+    console.print()
+    console.print(reaches)
+    console.print()
+    overlaps = [f"{o.first} and {o.second} by {1e3 * o.depth:.1f} mm ({o.where})" for o in found.overlaps]
+    console.print(f"penetrations at home and at goals: {'; '.join(overlaps) or 'none'}", soft_wrap=True)
+    console.print(
+        f"transitions {found.complete} -> {found.pruned}, {found.problems} conditional problems, at most "
+        f"{found.programs} programs; sequences {', '.join(found.sequences) or 'none named'}"
+        f"{'' if any(found.sequences.values()) else ', all paths of the graph' * bool(found.sequences)}",
+        soft_wrap=True,
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -62,6 +62,10 @@ MAY_IMPORT = {
         "transitions", "uct", "worker",
     },
     # the porch
+    "diagram": {"errors", "graph", "scene"},
+    "check": {
+        "errors", "audit", "constraints", "kinematics", "operators", "plans", "poses", "problems", "scene", "transitions",
+    },
     "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
     "api": {
         "errors", "audit", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record",
@@ -84,7 +88,7 @@ HOST = {
 }
 
 # Modules that scripts may read names from, beside `cgs_jax` itself: the homes of the public names and what is loaded on demand.
-DOORS = {*cgs_jax._HOMES.values(), "coverage", "experiments", "fitting", "render", "starter", "viewer", "record"}
+DOORS = {*cgs_jax._HOMES.values(), "coverage", "diagram", "experiments", "fitting", "record", "render", "starter", "viewer"}
 
 # The benchmark also times the parts apart.
 MEASURES_PARTS = {"benchmark": {"augmented_lagrangian", "operators", "plans", "poses", "seeds", "transitions"}}
