@@ -150,7 +150,8 @@ def check_problem(problem: Problem, seed: int = 0) -> ProblemCheck:
     faults = [fault for constraint in constraints for fault in _constraint_faults(constraint)]
     if rank < rows and not any("rank" in fault for fault in faults):
         faults.append(
-            f"the constraints depend on each other: {rows} equality rows in all, their Jacobian has rank {rank} at random points"
+            f"the constraints depend on each other: {rows} equality rows in all, "
+            f"their Jacobian has rank {rank} at random points"
         )
     faults += reach_faults
     faults += [f"{o.where}: geoms '{o.first}' and '{o.second}' penetrate by {1e3 * o.depth:.1f} mm" for o in overlaps]
@@ -189,10 +190,9 @@ def _wrong_with(problem: Problem, sequence: str) -> str:
 
 def _count_programs(problem: Problem, operators: Iterable[Operator]) -> int:
     """Programs for solving by layout, for clearances by layout and the shapes of their numbers."""
-    solves, clears = set(), {}
-    for operator in operators:
-        solves.add(operator.plan.layout)
-        clears |= {clear.constraint: clear for clear in operator.clears}
+    operators = tuple(operators)
+    solves = {operator.plan.layout for operator in operators}
+    clears = {clear.constraint: clear for operator in operators for clear in operator.clears}
     shapes = {(c.layout, str(jax.tree.map(np.shape, c.numbers(problem.params)))) for c in clears.values()}
     return len(solves) + len(shapes)
 
@@ -345,7 +345,8 @@ def _slope_error(jacobian: np.ndarray, differences: np.ndarray, columns: Mapping
 def _rank(matrix: np.ndarray) -> int:
     if not matrix.size or not np.isfinite(matrix).all():
         return 0
-    return int(np.linalg.matrix_rank(matrix, tol=1e-4 * max(np.linalg.norm(matrix, 2), 1e-12)))
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    return int((sizes > 1e-4 * sizes[0]).sum())
 
 
 def _constraint_faults(constraint: ConstraintCheck) -> list[str]:

@@ -164,7 +164,7 @@ def _circle(variable: Mapping[str, Any], x: float, y: float) -> list[str]:
     size = 13 if len(name) <= 5 else max(7, 13 * 5 / len(name))
     return [
         f'<g><title>{escape(name)}: {escape(variable["kind"])} with {dof} degrees of freedom</title>',
-        f'<circle cx="{x:.1f}" cy="{y}" r="{_RADIUS}" fill="{_COLOURS[variable["kind"]]}" stroke="#2c3e50" stroke-width="1.4"/>',
+        f'<circle cx="{x:.1f}" cy="{y}" r="{_RADIUS}" fill="{_COLOURS[variable["kind"]]}" stroke="#2c3e50"/>',
         f'<text x="{x:.1f}" y="{y + 2}" font-size="{size:.1f}" fill="#111111">{escape(name)}</text>',
         f'<text x="{x:.1f}" y="{y + 14}" font-size="9" fill="#333333">{dof}</text></g>',
     ]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from cgs_jax import diagram
 from cgs_jax.audit import Auditor
 from cgs_jax.coverage import duplicate_share, limit_share
 from cgs_jax.problems import Problem
@@ -222,6 +223,13 @@ class Recorder:
             f"{constraint} stopped {share:.0f} % of its failures"
         )
 
+    def progress(self, points: int = 200) -> dict[str, list[float]]:
+        """How many samples had been found after how many seconds of sampling, at up to so many moments."""
+        counts = np.cumsum([0, *(len(event.qpos) for event in self._found)])
+        seconds = np.array([0.0, *(event.elapsed for event in self._found)])
+        chosen = np.unique(np.linspace(0, len(counts) - 1, points).round().astype(int))
+        return {"seconds": seconds[chosen].tolist(), "samples": counts[chosen].tolist()}
+
     def spread(self, samples: SampleSet) -> dict[str, dict[str, float]]:
         """Per configuration variable: share of samples with a joint at a limit, and share with a near-duplicate."""
         task, model = self.problem.scene.task, self.problem.scene.model
@@ -250,6 +258,8 @@ class Recorder:
             "diagnosis": None if self.count else self.diagnosis(),
             "best_sequences": self.best_sequences(3),
             "spread": self.spread(samples),
+            "progress": self.progress(),
+            "graph": diagram.describe(self.problem.graph, self.problem.scene.task),
         }
         write_json(folder / "run.json", self.meta() | results | self.profile())
         return folder

@@ -63,10 +63,11 @@ MAY_IMPORT = {
     },
     # the porch
     "diagram": {"errors", "graph", "scene"},
+    "report": {"errors", "coverage", "diagram", "render", "samples"},
     "check": {
         "errors", "audit", "constraints", "kinematics", "operators", "plans", "poses", "problems", "scene", "transitions",
     },
-    "record": {"audit", "coverage", "problems", "sampler", "samples", "scene", "transitions", "uct"},
+    "record": {"audit", "coverage", "diagram", "problems", "sampler", "samples", "scene", "transitions", "uct"},
     "api": {
         "errors", "audit", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record",
         "sampler", "samples", "transitions", "uct",
@@ -85,10 +86,11 @@ HOST = {
     "fitting": {"numpy", "mujoco", "scipy"},
     "starter": {"numpy", "mujoco"},
     "record": {"numpy"},
+    "report": {"numpy", "scipy", "matplotlib", "PIL"},
 }
 
 # Modules that scripts may read names from, beside `cgs_jax` itself: the homes of the public names and what is loaded on demand.
-DOORS = {*cgs_jax._HOMES.values(), "coverage", "diagram", "experiments", "fitting", "record", "render", "starter", "viewer"}
+DOORS = {*cgs_jax._HOMES.values(), "coverage", "diagram", "experiments", "fitting", "record", "render", "report", "starter", "viewer"}
 
 # The benchmark also times the parts apart.
 MEASURES_PARTS = {"benchmark": {"augmented_lagrangian", "operators", "plans", "poses", "seeds", "transitions"}}
