@@ -180,6 +180,10 @@ def check_viewers(options: argparse.Namespace) -> None:
         from cgs_jax import render
 
         render.backend()
+    if options.report:
+        from cgs_jax import report
+
+        report.require_plots()
 
 
 @contextlib.contextmanager
@@ -291,7 +295,7 @@ def run(options: argparse.Namespace) -> int:
             drive(sampling, options, line, folder)
             line.enter_phase("writing")
             samples = write(sampling.record, options, folder)
-    return report(sampling.record, samples, options, folder)
+    return tell(sampling.record, samples, options, folder)
 
 
 def check(options: argparse.Namespace, folder: Path) -> int:
@@ -373,13 +377,17 @@ def write(record: Recorder, options: argparse.Namespace, folder: Path) -> Sample
         from cgs_jax import render
 
         render.save_pictures(samples, folder)
+    if options.report:
+        from cgs_jax import report
+
+        report.save_report(folder)
     return samples
 
 
-# ------------------------------------------------------------------ the report
+# ------------------------------------------------------------------ the closing words
 
 
-def report(record: Recorder, samples: SampleSet, options: argparse.Namespace, folder: Path) -> int:
+def tell(record: Recorder, samples: SampleSet, options: argparse.Namespace, folder: Path) -> int:
     """Prints what was found and where it is; returns the exit status."""
     if options.json:
         print((folder / "run.json").read_text(encoding="utf-8"), end="")

@@ -1,8 +1,9 @@
-"""Look at samples: contact sheet, animation, ghosts in one picture, web page, or MuJoCo's own viewer.
+"""Look at samples: contact sheet, animation, ghosts in one picture, web page, report, or MuJoCo's own viewer.
 
     python scripts/show.py samples.npz
     python scripts/show.py samples.npz --samples diverse:6 --switch handover --ghost ghosts.png
     python scripts/show.py samples.npz --view
+    python scripts/show.py runs/handover-0 --report
 
 Without a file to write and without a viewer it writes `samples_sheet.png` and `samples.gif` beside samples.npz.
 Exit status: 0, or 2 for bad input.
@@ -26,7 +27,7 @@ DEFAULT_CHOICE = "diverse:6"
 def parse() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description="Look at samples: contact sheet, animation, ghosts, web page, or MuJoCo's own viewer.",
-        epilog="Without --sheet, --gif, --ghost, --view or --mujoco: sheet and GIF are written beside the file.",
+        epilog="Without --sheet, --gif, --ghost, --report, --view or --mujoco: sheet and GIF are written beside the file.",
     )
     parser.add_argument("file", type=Path, help="samples.npz, or the directory that holds it")
     parser.add_argument(
@@ -38,6 +39,7 @@ def parse() -> argparse.ArgumentParser:
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="contact sheet: samples x mode switches")
     parser.add_argument("--gif", type=Path, metavar="FILE.gif", help="animation through the mode switches")
     parser.add_argument("--ghost", type=Path, metavar="FILE.png", help="all in one picture, the first one solid")
+    parser.add_argument("--report", action="store_true", help="report.html beside the file, from all files of the run")
     parser.add_argument("--hold-only", action="store_true", help="GIF without the frames between mode switches")
     parser.add_argument("--size", metavar="WxH", help="pixels of one picture (default 320x240, 480x360, 960x720)")
     parser.add_argument("--camera", metavar="A,E[,D]", help="azimuth and elevation in degrees, distance in m")
@@ -74,6 +76,12 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def show(options: argparse.Namespace) -> None:
+    if options.report:
+        from cgs_jax import report
+
+        print(report.save_report(options.file if options.file.is_dir() else options.file.parent))
+        if not (options.sheet or options.gif or options.ghost or options.view or options.mujoco):
+            return
     samples = SampleSet.load(options.file)
     if not len(samples):
         raise InputError(f"{options.file} holds no samples, nothing to show")
