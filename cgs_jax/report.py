@@ -133,6 +133,7 @@ table { border-collapse: collapse; width: 100%; font-size: 0.9rem; margin: 0.5re
 th, td { padding: 0.2rem 0.5rem; text-align: right; vertical-align: top; border-bottom: 1px solid #eaeef2; }
 th { color: #57606a; font-weight: 600; vertical-align: bottom; }
 th:first-child, td:first-child { text-align: left; overflow-wrap: break-word; }
+.step { display: block; padding-left: calc(var(--depth) * 0.8em); overflow-wrap: anywhere; }
 .bar { display: block; height: 0.35rem; background: #2f6fab; min-width: 1px; margin-left: auto; }
 pre { background: #f6f8fa; padding: 0.6rem; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 0.85rem; }
 @media (max-width: 40rem) {
@@ -143,7 +144,10 @@ pre { background: #f6f8fa; padding: 0.6rem; white-space: pre-wrap; overflow-wrap
   table.stacked td { border: 0; padding: 0.05rem 0; text-align: right; }
   table.stacked td:first-child { font-weight: 600; }
   table.stacked td:not(:first-child)::before { content: attr(data-label); color: #57606a; text-align: left; }
-  th, td { padding: 0.2rem 0.25rem; }
+  th, td { padding: 0.2rem; }
+  #tree { table-layout: fixed; font-size: 0.8rem; }
+  #tree th:first-child { width: 36%; }
+  .step { padding-left: calc(var(--depth) * 0.4em); }
 }
 @media print {
   @page { margin: 14mm; }
@@ -251,7 +255,7 @@ def _tree(tree: Mapping[str, Any]) -> str:
             entry = nodes[text]
             step = text[len(parent) + 2 :] if parent else text
             depth = len(_above(text))
-            label = f'<span style="display:block;padding-left:{0.8 * depth:.1f}em">{_name(step)}</span>'
+            label = f'<span class="step" style="--depth:{depth}">{_name(step)}</span>'
             per = entry["seconds_per_condition"]
             row = [label, f"{entry['visits']:.0f}{_bar(entry['visits'] / total)}", _percent(entry["success_rate"])]
             row.append("–" if per is None else f"{1e6 * per:.0f}")
@@ -260,8 +264,8 @@ def _tree(tree: Mapping[str, Any]) -> str:
 
     show("")
     left = len(nodes) - len(shown)
-    columns = ["assigned next", "visits", "success", "µs per condition", *(["value"] if has_value else [])]
-    note = "Visits are batches; success and time weigh recent batches more. " + (
+    columns = ["assigned next", "visits", "success", "µs each", *(["value"] if has_value else [])]
+    note = "Visits are batches. Success and device time are per condition; recent batches weigh more. " + (
         "The value is the tree's Q: finished samples that a condition leads to, less its time at the price of the run's rate. "
         if has_value
         else ""
@@ -382,7 +386,8 @@ def _pair_plot(name: str, labels: Sequence[str], columns: NDArray[np.float64]) -
                 np.add.at(panel, (cells[:, i], cells[:, j]), 1.0)
                 panel = np.sqrt(panel / panel.max())
             picture[i * side + 1 : i * side + 1 + BINS, j * side + 1 : j * side + 1 + BINS] = panel[::-1]
-    figure, (axes,) = _figure(5.0, 5.0, 1)
+    size = min(1.4 + 0.8 * count, 5.0)
+    figure, (axes,) = _figure(size, size, 1)
     axes.imshow(picture, cmap="Blues", vmin=0.0, vmax=1.0, interpolation="nearest")
     middles = np.arange(count) * side + side / 2 - 0.5
     ranges = [f"{label}\n{a:.2g}\n{b:.2g}" for label, a, b in zip(labels, low, high, strict=True)]

@@ -198,11 +198,12 @@ def test_nothing_is_fetched_and_no_name_is_used_twice(finished):
         assert sheet.format == "PNG" and sheet.size[0] > 600
 
 
-def test_a_later_report_is_the_same(finished, copied, capsys):
+def test_a_later_report_is_the_same(finished, copied, capsys, monkeypatch):
     assert show.main([str(copied), "--report"]) == 0
     assert capsys.readouterr().out.strip() == str(copied / "report.html")
     assert (copied / "report.html").read_bytes() == (finished / "report.html").read_bytes()
     (copied / "report.html").unlink()
+    monkeypatch.setattr(render, "contact_sheet", lambda *_: np.zeros((8, 8, 3), np.uint8))
     assert show.main([str(copied / "samples.npz"), "--report"]) == 0 and (copied / "report.html").exists()
 
 
@@ -264,14 +265,25 @@ def test_what_is_no_run_is_told_in_one_line(copied, spoil, said):
 # ------------------------------------------------------------------ in a browser
 
 
-def test_it_fits_a_phone_and_paper_and_asks_for_nothing(finished):
+def long_tree(tree, depth=9):
+    """The tree with a branch of many steps that assign many variables with long names."""
+    step = "(" + ",".join(f"q_variable{i}" for i in range(8)) + ")"
+    entry = {**tree["sequences"][0], "visits": 1234.0, "success_rate": 1.0, "seconds_per_condition": 1.0, "q": -12.34}
+    branch = [{**entry, "sequence": "; ".join([step] * i)} for i in range(1, depth + 1)]
+    return {**tree, "sequences": [*tree["sequences"], *branch]}
+
+
+def test_it_fits_a_phone_and_paper_and_asks_for_nothing(copied):
+    _, tree = read(copied)
+    (copied / "tree.json").write_text(json.dumps(long_tree(tree)))
+    page = report.save_report(copied)
     browser = open_browser()
     try:
         browser.set_page_load_timeout(120)
         for width in (390, 1200):
             screen = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 500}
             browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-            browser.get((finished / "report.html").as_uri())
+            browser.get(page.as_uri())
             end = time.monotonic() + 60
             while browser.execute_script("return document.readyState") != "complete":
                 assert time.monotonic() < end, "the page does not load"
