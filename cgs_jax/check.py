@@ -43,7 +43,7 @@ SLOPE_TOLERANCE = 1e-2
 GAP_SHARE = 0.15
 """A pose is out of reach when every random configuration of the robot stays further away than this share of its reach."""
 
-LISTED = 20_000
+LISTED = 5000
 """Transitions that are enumerated at most; larger graphs are counted no further."""
 
 
@@ -119,7 +119,7 @@ class ProblemCheck:
     complete: int
     """Transitions before pruning."""
     pruned: int
-    """Transitions that are kept, counted up to `LISTED`."""
+    """Transitions that are kept, counted up to `LISTED`; so are the problems and programs below."""
     problems: int
     """Distinct conditional problems among them."""
     programs: int
@@ -128,6 +128,11 @@ class ProblemCheck:
     """The task's sequences by name; "" where one is a path of the graph, else what is wrong with it."""
     faults: tuple[str, ...]
     """One line each."""
+
+    @property
+    def counted_all(self) -> bool:
+        """False where the graph has more transitions than are enumerated."""
+        return self.pruned < LISTED
 
     def as_json(self) -> dict[str, Any]:
         """Plain data."""

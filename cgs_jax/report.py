@@ -146,7 +146,10 @@ pre { background: #f6f8fa; padding: 0.6rem; white-space: pre-wrap; overflow-wrap
   table.stacked td:not(:first-child)::before { content: attr(data-label); color: #57606a; text-align: left; }
   th, td { padding: 0.2rem; }
   #tree { table-layout: fixed; font-size: 0.8rem; }
-  #tree th:first-child { width: 36%; }
+  #tree th:first-child { width: 34%; }
+  #tree th:nth-child(3) { width: 19%; }
+  .graph { overflow-x: auto; }
+  .graph svg { max-width: none; }
   .step { padding-left: calc(var(--depth) * 0.4em); }
 }
 @media print {
@@ -187,7 +190,7 @@ def _name(text: str) -> str:
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.1f} %"
+    return "–" if share is None else f"{100 * share:.1f}\N{NARROW NO-BREAK SPACE}%"
 
 
 def _bar(share: float) -> str:
@@ -215,10 +218,8 @@ def _head(run: Mapping[str, Any], title: str) -> str:
 
 def _graph(run: Mapping[str, Any]) -> str:
     counts = run["transitions"]
-    return (
-        f"<figure>{diagram.draw(run['graph'])}</figure>\n<p>Of {counts['complete']} transitions between sets of assigned "
-        f"variables, {counts['pruned']} are kept.</p>"
-    )
+    kept = f"<p>Of {counts['complete']} transitions between sets of assigned variables, {counts['pruned']} are kept.</p>"
+    return f'<figure class="graph">{diagram.draw(run["graph"])}</figure>\n{kept}'
 
 
 def _over_time(run: Mapping[str, Any]) -> str:

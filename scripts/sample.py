@@ -530,8 +530,9 @@ def print_check(console: Console, found: ProblemCheck) -> None:
     console.print()
     overlaps = [f"{o.first} and {o.second} by {1e3 * o.depth:.1f} mm ({o.where})" for o in found.overlaps]
     console.print(f"penetrations at home and at goals: {'; '.join(overlaps) or 'none'}", soft_wrap=True)
+    more = "" if found.counted_all else "more than "
     console.print(
-        f"transitions {found.complete} -> {found.pruned}, {found.problems} conditional problems, at most "
+        f"transitions {found.complete} -> {more}{found.pruned}, {found.problems} conditional problems, at most "
         f"{found.programs} programs; sequences {', '.join(found.sequences) or 'none named'}"
         f"{'' if any(found.sequences.values()) else ', all paths of the graph' * bool(found.sequences)}",
         soft_wrap=True,
