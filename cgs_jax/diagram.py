@@ -37,6 +37,10 @@ def describe(graph: ConstraintGraph, task: Task) -> dict[str, Any]:
         columns |= dict.fromkeys(switch.configurations.values(), (k, k))
     columns |= {placement.variable: (task.switch_index(placement.at),) * 2 for placement in task.placements}
     columns |= {hold.variable: task.span(hold) for hold in task.holds}
+    for own in [v.name for v in graph.variables if v.name not in columns]:
+        # A variable that the task does not know stands among those that it is tied to.
+        near = [k for name in graph.neighbours(own) for k in columns.get(name, ())]
+        columns[own] = (min(near, default=0), max(near, default=0))
     return {
         "name": graph.name,
         "switches": [switch.name for switch in task.switches],

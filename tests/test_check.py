@@ -295,3 +295,20 @@ def test_the_drawing_has_every_variable_constraint_and_edge_and_no_two_on_one_pl
     for hold in at.scene.task.holds:
         first, last = at.scene.task.span(hold)
         assert spans[first][0] < place[hold.variable] < spans[last][1]
+
+
+def test_a_variable_of_ones_own_is_checked_and_drawn_beside_what_it_is_tied_to():
+    at = cgs_jax.with_variable(problem("pick_place"), "f", 1, -40.0, 40.0)
+    at = cgs_jax.with_constraint(at, "Push(q2,f)", ["q2", "f"], lambda q2, f: f - 20.0 * q2[:1], "equality", 1)
+    found = check.check_problem(at)
+    # The task's own sequences do not assign it.
+    assert all("is no path" in fault for fault in found.faults) and len(found.faults) == len(found.sequences)
+    assert found.rank == found.equality_rows == 17
+    (push,) = [c for c in found.constraints if c.name == "Push(q2,f)"]
+    assert push.rank == 1 and push.slope_error < 1e-3 and push.dof == 8
+    described = diagram.describe(at.graph, at.scene.task)
+    (own,) = [v for v in described["variables"] if v["name"] == "f"]
+    assert own["kind"] == "vector" and own["columns"] == [1, 1]
+    root = ElementTree.fromstring(diagram.draw(described))
+    places = {c.get("cx") for c in root.iter(f"{SVG}circle")}
+    assert len(places) == len(at.graph.variables)
