@@ -6,8 +6,8 @@
     python scripts/sample.py --scene handover --check
 
 Writes samples.npz, tree.json and run.json; while it runs, what it has found so far to samples.parts. Exit status: 0 with at
-least one sample (also after Ctrl-C), 3 with none (one line says which operator and constraint stopped it), 2 for bad input. With
---check nothing is sampled: 0 when all is well, 2 with one line per fault.
+least one sample (also after Ctrl-C), 3 with none (one line says which operator and constraint stopped it), 2 for bad input.
+With --check nothing is sampled: 0 when all is well, 2 with one line per fault.
 """
 
 from __future__ import annotations

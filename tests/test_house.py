@@ -90,7 +90,10 @@ HOST = {
 }
 
 # Modules that scripts may read names from, beside `cgs_jax` itself: the homes of the public names and what is loaded on demand.
-DOORS = {*cgs_jax._HOMES.values(), "coverage", "diagram", "experiments", "fitting", "record", "render", "report", "starter", "viewer"}
+DOORS = {
+    *cgs_jax._HOMES.values(),
+    *("coverage", "diagram", "experiments", "fitting", "record", "render", "report", "starter", "viewer"),
+}
 
 # The benchmark also times the parts apart.
 MEASURES_PARTS = {"benchmark": {"augmented_lagrangian", "operators", "plans", "poses", "seeds", "transitions"}}
