@@ -207,18 +207,20 @@ class BatchRunner:
         device = -time.perf_counter()
         first = np.uint32(batch.first_task % 2**32)
         result = self._call(operator, 0, key, first, np.int32(count), given, of_function, numbers)
+        # Slices of device arrays would be device programs of their own.
+        result = jax.tree.map(np.asarray, result)
         device += time.perf_counter()
-        rows_hold = np.asarray(result.feasible)[:count]
-        iterations = int(np.asarray(result.iterations)[:count].sum())
+        rows_hold = result.feasible[:count]
+        iterations = int(result.iterations[:count].sum())
         failures: dict[str, int] = {}
         if operator.measured:
-            violation = np.asarray(result.violation)[: len(operator.measured), :count]
+            violation = result.violation[: len(operator.measured), :count]
             worst = np.argmax(violation[:, ~rows_hold], axis=0)
             for at, times in zip(*np.unique(worst, return_counts=True), strict=True):
                 failures[operator.measured[at]] = int(times)
         success = np.flatnonzero(rows_hold)
         proposed = len(success)
-        new = {name: np.asarray(value)[success] for name, value in operator.named(result).items()}
+        new = {name: value[success] for name, value in operator.named(result).items()}
         values = {name: value[success] for name, value in batch.conditions.items()} | new
         for position, clear in enumerate(operator.clears, start=1):
             if not len(success):

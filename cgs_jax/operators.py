@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from scipy.spatial.transform import Rotation
 
 from cgs_jax import augmented_lagrangian as al
 from cgs_jax.collisions import Body, ClearanceData, place_object, place_robot, smallest_distance
@@ -25,7 +26,7 @@ from cgs_jax.constraints import OwnSampler, PoseRows, Term, row_data
 from cgs_jax.kinematics import Chain, joint_frames, padded, tool_pose, tool_poses_on_host
 from cgs_jax.plans import Layout, Plan, PlanSystem, Point, Shared, Tasks, make_plan
 from cgs_jax.poses import Array, Pose, compose, from_vector, inverse, to_vector
-from cgs_jax.problems import Params, Problem, pose_vector
+from cgs_jax.problems import Params, Problem
 from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, draw_own, pose_seed, uniforms
 from cgs_jax.transitions import Transition
 
@@ -491,7 +492,8 @@ def _tool_vector(chain: Chain, q: Array) -> Array:
     """Tool poses `(lanes, 7)` of a chain at given configurations `(lanes, dof)`."""
     if isinstance(q, np.ndarray):
         rotation, position = tool_poses_on_host(chain, q)
-        return np.stack([pose_vector(r, x) for r, x in zip(rotation, position, strict=True)]).astype(np.float32)
+        quat = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        return np.concatenate([position, quat], axis=1).astype(np.float32)
     return to_vector(tool_pose(chain, joint_frames(chain, q.T[: chain.offset.shape[0]]))).T
 
 

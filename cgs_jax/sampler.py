@@ -172,7 +172,7 @@ FIRST_GUESS = 6e-8
 LEAST_UNKNOWNS = 7
 """Programs with fewer unknowns than an arm has joints take as long as if they had so many: copies and clearances remain."""
 
-REPRESENTATIVE = 256
+REPRESENTATIVE = 128
 """Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
 
 TRIES = 0
@@ -210,27 +210,35 @@ class _Pace:
     """
 
     def __init__(self) -> None:
-        self._programs: dict[Any, float] = {}  # seconds per unit of work and squared unknown
-        self._all = 0.0
+        # Seconds and units of work (tasks and iterations times squared unknowns), discounted, large batches first.
+        self._programs: dict[Any, tuple[float, float]] = {}
+        self._all = 0.0, 0.0
         self._work_per_task: dict[int, float] = {}
 
     def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float) -> float:
         """Device seconds to charge for a batch, whose measured time is taken into account."""
         program, work = operator.plan.layout, (tasks + iterations) * _squared_unknowns(operator)
         if tasks >= REPRESENTATIVE:
-            unit, known = measured / work, self._programs.get(program)
-            self._programs[program] = unit if known is None else 0.9 * known + 0.1 * unit
-            self._all = 0.9 * self._all + 0.1 * unit if self._all else unit
+            self._programs[program] = _mixed(self._programs.get(program, (0.0, 0.0)), measured, work, tasks)
+            self._all = _mixed(self._all, measured, work, tasks)
         known = self._work_per_task.get(operator.identity, work / tasks)
         self._work_per_task[operator.identity] = 0.7 * known + 0.3 * work / tasks
-        unit = self._programs.get(program, self._all)
-        return unit * work if unit else measured
+        return self._unit(program) * work or measured
+
+    def _unit(self, program: Any) -> float:
+        seconds, work = self._programs.get(program, self._all)
+        return seconds / work if work else 0.0
 
     def seconds_per_task(self, operator: Operator) -> float:
         """Expected device seconds per task of a large batch."""
         # Before its first batch: about seven iterations.
         work = self._work_per_task.get(operator.identity, 8.0 * _squared_unknowns(operator))
-        return work * (self._programs.get(operator.plan.layout, self._all) or FIRST_GUESS)
+        return work * (self._unit(operator.plan.layout) or FIRST_GUESS)
+
+
+def _mixed(known: tuple[float, float], seconds: float, work: float, tasks: int) -> tuple[float, float]:
+    """Old evidence discounted, and a batch with the weight of its number of tasks."""
+    return 0.9 * known[0] + tasks * seconds, 0.9 * known[1] + tasks * work
 
 
 def _squared_unknowns(operator: Operator) -> int:
@@ -521,7 +529,7 @@ class Sampler:
             young = visits < 2
             most = self._affordable(step.operator)
             if visits < LOOKS:
-                most = max(most * (visits + 1) // LOOKS, min(16, batch))
+                most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
             enough = max(most // (2 if young else 4), 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
