@@ -183,8 +183,8 @@ def request(name: str, function: Callable, arguments: tuple, key: str | None = N
     with _lock:
         if known not in _compiled:
             if _pool is None:
-                # One thread: two compilations at a time would double the memory and gain nothing beside sampling.
-                _pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
+                # Tracing holds the interpreter, generating code does not: two threads overlap them.
+                _pool = ThreadPoolExecutor(2, thread_name_prefix="compile")
             shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), arguments)
             _compiled[known] = _pool.submit(_make, name, function, shapes, key)
         return _compiled[known]

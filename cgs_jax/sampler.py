@@ -474,11 +474,14 @@ class Sampler:
         return operators
 
     def _cheapest_path(self, order: list[Transition]) -> Path:
-        """A complete sequence over the smallest operators that allow one."""
+        """A complete sequence that few and small solver programs allow: one if there is such, else the smallest ones."""
         transitions = self.problem.transitions
-        allowed: set = set()
+        of_program: dict[Any, set] = {}
         for transition in order:
-            allowed.add(transition.problem)
+            of_program.setdefault(operator_of(self.problem, transition).plan.layout, set()).add(transition.problem)
+        smallest: set = set()
+        prefixes = [smallest := smallest | problems for problems in of_program.values()]
+        for allowed in [*of_program.values(), *prefixes]:
             path = _greedy_path(transitions, allowed)
             if path:
                 return path
