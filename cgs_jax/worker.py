@@ -8,6 +8,7 @@ loads the scene by name, so only problems that `load_problem` made can be sent (
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import signal
@@ -165,11 +166,12 @@ def _loaded(data: bytes) -> Program | None:
 
 
 def main() -> None:
-    """Serves standard input until it ends."""
+    """Serves standard input until it ends, or until nobody reads the answers."""
     # Ctrl-C reaches the whole group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sink = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     # Whatever else is printed must not end up among the answers.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    serve(sys.stdin.buffer, sink)
+    with contextlib.suppress(BrokenPipeError):
+        serve(sys.stdin.buffer, sink)
     os._exit(0)
