@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import itertools
 import os
 import pickle
 import platform
@@ -26,6 +27,7 @@ from jax.experimental import serialize_executable
 CACHE_BYTES = 512 * 2**20
 """Size to which the cache on disk is kept; the programs used longest ago go first."""
 
+_numbers = itertools.count()
 _lock = threading.Lock()
 _compiled: dict[Any, Future] = {}
 _pool: ThreadPoolExecutor | None = None
@@ -139,6 +141,8 @@ class Program:
 
     def __init__(self, name: str, executable: Any, seconds: float, portable: bytes | None = None) -> None:
         self.name, self.seconds = name, seconds
+        self.number = next(_numbers)
+        """Tells the programs of this process apart."""
         self.reported = False
         """Whether a run has counted its compile seconds."""
         self.loaded = portable is not None

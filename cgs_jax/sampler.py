@@ -26,12 +26,11 @@ import numpy as np
 from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
-from cgs_jax.errors import InputError
 from cgs_jax.operators import Operator, operator_of
 from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.transitions import Transition
 from cgs_jax.uct import Chooser
-from cgs_jax.worker import Setup, Worker
+from cgs_jax.worker import Setup, Worker, dismiss, hire
 
 Path = tuple[Transition, ...]
 
@@ -251,9 +250,10 @@ class _Crew:
     def __init__(self, runner: BatchRunner, workers: int, setup: Setup | None) -> None:
         self._free: queue.SimpleQueue[BatchRunner | Worker] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._wanted, self._arrived = workers, 0
+        self._wanted = workers
+        self._arrived: list[Worker] = []
         self._local = runner
-        self._refusal: InputError | None = None
+        self._refusal: Exception | None = None
         self.size = 0
         """Batches that can run at once now."""
         self._workers: list[Worker] = []
@@ -271,15 +271,15 @@ class _Crew:
             self.size = min(self.size + 1, self._wanted)
 
     def _hire(self, setup: Setup) -> None:
-        worker = Worker(setup)
+        worker = hire(setup)
         self._workers.append(worker)
 
         def arrive() -> None:
             try:
                 if worker.await_ready():
-                    self._arrived += 1
+                    self._arrived.append(worker)
                     self._seat(worker)
-            except InputError as error:
+            except Exception as error:  # noqa: BLE001 - raised by the next batch
                 self._refusal = error
 
         threading.Thread(target=arrive, daemon=True).start()
@@ -292,7 +292,7 @@ class _Crew:
             return self._local.run(batch)
         member = self._free.get()
         # With all workers there, this process has its core for compiling and deciding.
-        if member is self._local and self._workers and self._arrived == self._wanted:
+        if member is self._local and self._workers and len(self._arrived) == self._wanted:
             member = self._free.get()
         try:
             if isinstance(member, Worker):
@@ -303,9 +303,12 @@ class _Crew:
             self._free.put(member)
 
     def close(self) -> None:
-        """Ends the worker processes."""
+        """Ends the worker processes, but for those that have arrived and wait: the next run takes them. No batch may run."""
         for worker in self._workers:
-            worker.close()
+            if worker in self._arrived:
+                dismiss(worker)
+            else:
+                worker.close()
 
 
 class Sampler:

@@ -30,7 +30,7 @@ ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 @dataclass(frozen=True)
 class Setup:
-    """Second message, after the digest of the sources: what the worker needs to make its runner."""
+    """What the worker needs to make its runner: the second message, after the digest of the sources, and before another run."""
 
     scene: str
     instance: int
@@ -49,9 +49,9 @@ class Install:
 
 
 class Worker:
-    """A batch runner in another process; one batch at a time."""
+    """A batch runner in another process; one batch at a time. Made by `hire`."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self) -> None:
         self._process = subprocess.Popen(
             # Not -m: the messages' classes must be those of the imported module.
             [sys.executable, "-c", "from cgs_jax.worker import main; main()"],
@@ -60,9 +60,17 @@ class Worker:
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
         self._send(SOURCES)
-        self._send(setup)
         self._installed: set[int] = set()
         self._sent: set[int] = set()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def begin(self, setup: Setup) -> None:
+        """Starts on a problem; `await_ready` tells when it can take batches. Programs that were sent before stay."""
+        self._installed.clear()
+        self._send(setup)
 
     def install(self, identity: int, programs: Sequence[Program]) -> None:
         """Makes sure that the worker has the programs of an operator; they are compiled in one process only."""
@@ -71,18 +79,19 @@ class Worker:
         self._installed.add(identity)
         if any(program.portable is None for program in programs):
             return  # it makes its own, from JAX's cache
-        numbers = tuple(id(program) for program in programs)
+        numbers = tuple(program.number for program in programs)
         missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
         self._sent.update(missing)
         self._send(Install(identity, numbers, missing))
 
     def await_ready(self) -> bool:
-        """Waits until it can take batches; False when it ended before. Raises InputError when it runs other sources."""
+        """Waits until it can take batches; False when it ended before. Raises InputError when it runs other sources,
+        and what stopped it from loading the problem."""
         try:
             answer = pickle.load(self._pipe_from())
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
             return False
-        if isinstance(answer, InputError):
+        if isinstance(answer, BaseException):
             raise answer
         return True
 
@@ -119,6 +128,30 @@ class Worker:
                     pass
 
 
+_idle: list[Worker] = []
+
+
+def hire(setup: Setup) -> Worker:
+    """A worker for a run: one that an earlier run of this process left, or a new one."""
+    while _idle:
+        worker = _idle.pop()
+        if worker.alive:
+            worker.begin(setup)
+            return worker
+        worker.close()
+    worker = Worker()
+    worker.begin(setup)
+    return worker
+
+
+def dismiss(worker: Worker) -> None:
+    """Keeps a worker that waits for work until the next run; it ends with this process. One is kept for each core."""
+    if worker.alive and len(_idle) < (os.cpu_count() or 1):
+        _idle.append(worker)
+    else:
+        worker.close()
+
+
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
     """Answers messages until the source ends."""
 
@@ -135,18 +168,18 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             )
         )
         return
-    setup: Setup = pickle.load(source)
-    problem = load_problem(setup.scene, setup.instance)
-    runner = BatchRunner(problem, setup.seed, setup.settings, setup.tolerances)
-    answer("ready")
     loaded: dict[int, Program | None] = {}
     while True:
         try:
-            message: Install | Batch = pickle.load(source)
+            message: Setup | Install | Batch = pickle.load(source)
         except EOFError:
             return
         try:
-            if isinstance(message, Install):
+            if isinstance(message, Setup):
+                problem = load_problem(message.scene, message.instance)
+                runner = BatchRunner(problem, message.seed, message.settings, message.tolerances)
+                answer("ready")
+            elif isinstance(message, Install):
                 loaded |= {number: _loaded(data) for number, data in message.programs.items()}
                 received = [loaded[number] for number in message.numbers]
                 if all(received):  # else the runner compiles its own

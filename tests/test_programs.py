@@ -130,3 +130,24 @@ def test_a_worker_compiles_what_it_cannot_load():
     number = operator_of(at, batch.transition).identity
     answers = told(programs.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}), batch)
     assert answers[0] == "ready" and len(answers) == 2 and answers[1].success.all()
+
+
+def test_a_worker_serves_one_run_after_another():
+    at, batch = grasps()
+    first, second = (worker.Setup(at.source[0], instance, 0, SMALL, None) for instance in (at.source[1], 3))
+    answers = told(programs.SOURCES, first, batch, second, batch)
+    assert answers[0] == answers[2] == "ready" and len(answers) == 4
+    assert answers[1].success.all() and answers[3].success.all()
+
+
+def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
+    monkeypatch.setattr(worker, "_idle", [])
+    at = cgs_jax.load_problem("pick_place")
+    seen = []
+    for seed in range(2):
+        cgs_jax.sample(at, time_budget=60.0, num_samples=40_000, seed=seed, method="expert3")
+        seen.append({one._process.pid for one in worker._idle})
+        assert all(one.alive for one in worker._idle)
+    assert seen[0] and seen[0] <= seen[1]
+    for one in worker._idle:
+        one.close()
