@@ -536,7 +536,7 @@ class Sampler:
             most = self._affordable(step.operator)
             if visits < LOOKS:
                 most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
-            enough = max(most // (2 if young else 4), 1)
+            enough = max(most // 2, 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
                 count = most
