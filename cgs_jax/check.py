@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cgs_jax.audit import Tolerances
-from cgs_jax.constraints import PoseRows
+from cgs_jax.constraints import Function, PoseRows
 from cgs_jax.errors import InputError
 from cgs_jax.kinematics import Chain
 from cgs_jax.operators import Operator, gather_given, operator_of
@@ -29,7 +29,7 @@ from cgs_jax.plans import PlanSystem, Point, Shared, Tasks, all_atoms, multiply_
 from cgs_jax.poses import Pose, from_vector
 from cgs_jax.problems import Problem
 from cgs_jax.scene import Hold, TwoFingerGrasp, object_pose_sources
-from cgs_jax.transitions import Transition
+from cgs_jax.transitions import Transition, Transitions
 
 POINTS = 8
 """Random points at which Jacobians are looked at."""
@@ -125,9 +125,12 @@ class ProblemCheck:
     programs: int
     """Device programs that would serve them all."""
     sequences: Mapping[str, str]
-    """The task's sequences by name; "" where one is a path of the graph, else what is wrong with it."""
+    """The task's sequences by name; "" where one is a path of the graph, else what is wrong with it (a fault, or a note)."""
     faults: tuple[str, ...]
     """One line each."""
+    notes: tuple[str, ...] = ()
+    """What is worth knowing and no fault, one line each: the task's sequences that variables or constraints added to it make
+    no path."""
 
     @property
     def counted_all(self) -> bool:
@@ -150,7 +153,7 @@ def check_problem(problem: Problem, seed: int = 0) -> ProblemCheck:
     graph, task = problem.graph, problem.scene.task
     listed = list(itertools.islice(problem.transitions.iterate(), LISTED))
     operators = {transition.problem: operator_of(problem, transition) for transition in listed}
-    sequences = {name: _wrong_with(problem, text) for name, text in task.sequences.items()}
+    sequences = {name: _wrong_with(problem.transitions, text) for name, text in task.sequences.items()}
     rows = sum(constraint.equality_rows for constraint in graph.constraints)
     faults = [fault for constraint in constraints for fault in _constraint_faults(constraint)]
     if rank < rows and not any("rank" in fault for fault in faults):
@@ -162,8 +165,13 @@ def check_problem(problem: Problem, seed: int = 0) -> ProblemCheck:
     faults += [f"{o.where}: geoms '{o.first}' and '{o.second}' penetrate by {1e3 * o.depth:.1f} mm" for o in overlaps]
     if not listed:
         faults.append("no sequence assigns all variables: some have more equality rows than degrees of freedom")
-    else:
-        faults += [f"sequence '{name}' is no path of the pruned graph: {wrong}" for name, wrong in sequences.items() if wrong]
+    notes = []
+    paths_of_task = _paths_of_task(problem) if any(sequences.values()) else ()
+    for name, wrong in sequences.items():
+        if wrong and name in paths_of_task:
+            notes.append(f"sequence '{name}' of the task is no path with what was added to it: {wrong}")
+        elif wrong and listed:
+            faults.append(f"sequence '{name}' is no path of the pruned graph: {wrong}")
     return ProblemCheck(
         scene=problem.name,
         instance=problem.scene.instance,
@@ -182,12 +190,26 @@ def check_problem(problem: Problem, seed: int = 0) -> ProblemCheck:
         programs=_count_programs(problem, operators.values()),
         sequences=sequences,
         faults=tuple(faults),
+        notes=tuple(notes),
     )
 
 
-def _wrong_with(problem: Problem, sequence: str) -> str:
+def _paths_of_task(problem: Problem) -> list[str]:
+    """Names of the task's sequences that are paths of its own graph; none where nothing was added to it."""
+    graph = problem.graph
+    variables = tuple(v for v in graph.variables if v.name not in problem.vectors)
+    added = {name for name, declaration in problem.declarations.items() if isinstance(declaration, Function)}
+    added |= {sampler.link for sampler in problem.samplers}
+    constraints = tuple(c for c in graph.constraints if c.name not in added)
+    if (variables, constraints) == (graph.variables, graph.constraints):
+        return []
+    transitions = Transitions(dataclasses.replace(graph, variables=variables, constraints=constraints))
+    return [name for name, text in problem.scene.task.sequences.items() if not _wrong_with(transitions, text)]
+
+
+def _wrong_with(transitions: Transitions, sequence: str) -> str:
     try:
-        problem.transitions.parse(sequence)
+        transitions.parse(sequence)
     except InputError as error:
         return str(error)
     return ""

@@ -121,6 +121,11 @@ class OwnSampler:
     given: tuple[str, ...]
     single: bool
 
+    @property
+    def link(self) -> str:
+        """Name of the constraint without rows that ties what is given to what is drawn, where no other does."""
+        return f"Sampler({','.join(self.variables)}|{','.join(self.given)})"
+
     def draw(self, key: jax.Array, given: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
         """Values by variable, for one lane."""
         result = self.function(key, **given)

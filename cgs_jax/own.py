@@ -143,9 +143,8 @@ def with_sampler(
     tied = {v for c in problem.graph.constraints if set(c.scope) <= scope and set(c.scope) & set(names) for v in c.scope}
     if not set(given) <= tied:
         # Values depend on what they were drawn from; the graph must know.
-        link = f"Sampler({','.join(names)}|{','.join(given)})"
-        _check_free(problem, link)
-        problem = _linked(problem, Constraint(link, "Sampler", problem.graph.ordered(scope), 0, 0))
+        _check_free(problem, sampler.link)
+        problem = _linked(problem, Constraint(sampler.link, "Sampler", problem.graph.ordered(scope), 0, 0))
     return dataclasses.replace(problem, samplers=(*problem.samplers, sampler), operators={}, source=None)
 
 

@@ -103,9 +103,9 @@ def test_ranks_agree_with_differences_of_the_products_in_double_precision():
 # ------------------------------------------------------------------ faults
 
 
-def fault_of(found, said, besides="nothing else"):
-    """The one fault, apart from those that say something known."""
-    (fault,) = [fault for fault in found.faults if besides not in fault]
+def fault_of(found, said):
+    """The one fault."""
+    (fault,) = found.faults
     assert re.search(said, fault) and "\n" not in fault
     return fault
 
@@ -140,7 +140,7 @@ def test_rows_that_depend_on_each_other_are_named(monkeypatch):
     of_rows(monkeypatch, "Twice(q1)")
     twice = lambda q1: jnp.stack([q1[0], 2 * q1[0]])  # noqa: E731
     at = cgs_jax.with_constraint(problem("pick_place"), "Twice(q1)", ["q1"], twice, "equality", 2)
-    fault_of(check.check_problem(at), r"^Twice\(q1\): 2 equality rows are declared, its Jacobian has rank 1", "no path")
+    fault_of(check.check_problem(at), r"^Twice\(q1\): 2 equality rows are declared, its Jacobian has rank 1")
 
 
 def test_constraints_that_depend_on_each_other_are_told_together():
@@ -148,7 +148,7 @@ def test_constraints_that_depend_on_each_other_are_told_together():
     at = cgs_jax.with_constraint(problem("pick_place"), "Low(q1)", ["q1"], low, "equality", 1)
     at = cgs_jax.with_constraint(at, "Again(q1)", ["q1"], low, "equality", 1)
     found = check.check_problem(at)
-    fault_of(found, "depend on each other: 18 equality rows in all, their Jacobian has rank 17", "no path")
+    fault_of(found, "depend on each other: 18 equality rows in all, their Jacobian has rank 17")
 
 
 def test_a_pose_out_of_reach_is_named_with_its_robot(tmp_path, monkeypatch):
@@ -210,6 +210,19 @@ def test_a_sequence_that_is_no_path_is_named(tmp_path, monkeypatch):
     found = check.check_problem(problems.load_problem(text))
     assert found.sequences["expert2"] and not found.sequences["expert1"]
     fault_of(found, r"sequence 'expert2' is no path of the pruned graph: step 1 \(q1\) is not possible")
+
+
+def test_a_sequence_that_only_an_added_constraint_stops_is_a_note_and_a_wrong_one_still_a_fault(tmp_path, monkeypatch):
+    of_rows(monkeypatch)
+    text = edited(tmp_path, lambda text: re.sub(r'expert3 = ".*"', 'expert3 = "q1; t; q2"', text))
+    low = lambda t, q1: q1[:2] - t[:2]  # noqa: E731
+    at = problems.load_problem(text)
+    assert check.check_problem(at).notes == ()
+    # Given t, q1 has 7 degrees of freedom and 6 + 2 rows: it must come with t.
+    found = check.check_problem(cgs_jax.with_constraint(at, "Low(t,q1)", ["t", "q1"], low, "equality", 2))
+    fault_of(found, r"^sequence 'expert3' is no path of the pruned graph: step 1 \(q1\)")
+    (note,) = found.notes
+    assert note.startswith("sequence 'expert2' of the task is no path with what was added to it: step 1 (t)")
 
 
 # ------------------------------------------------------------------ the command
@@ -301,8 +314,9 @@ def test_a_variable_of_ones_own_is_checked_and_drawn_beside_what_it_is_tied_to()
     at = cgs_jax.with_variable(problem("pick_place"), "f", 1, -40.0, 40.0)
     at = cgs_jax.with_constraint(at, "Push(q2,f)", ["q2", "f"], lambda q2, f: f - 20.0 * q2[:1], "equality", 1)
     found = check.check_problem(at)
-    # The task's own sequences do not assign it.
-    assert all("is no path" in fault for fault in found.faults) and len(found.faults) == len(found.sequences)
+    # The task's own sequences do not assign it, which is none of their faults.
+    assert found.faults == () and len(found.notes) == len(found.sequences) == 3
+    assert all(f"'{name}' of the task is no path" in note for name, note in zip(found.sequences, found.notes, strict=True))
     assert found.rank == found.equality_rows == 17
     (push,) = [c for c in found.constraints if c.name == "Push(q2,f)"]
     assert push.rank == 1 and push.slope_error < 1e-3 and push.dof == 8
