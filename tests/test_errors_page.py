@@ -1,17 +1,21 @@
 """docs/errors.md against the messages themselves: mistakes are made here, and each must be answered by a row of the page."""
 
 import importlib.util
+import io
+import pickle
 import re
 import shutil
+import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from loaded import problem
 
 import cgs_jax
-from cgs_jax import api, render
+from cgs_jax import api, problems, render, report, worker
 from cgs_jax.errors import InputError
 from cgs_jax.record import Recorder
 from cgs_jax.samples import SampleSet
@@ -27,12 +31,22 @@ UNTRIED = {
     "no sample: operator … succeeded … of … times; … stopped … % of its failures": "a run, in test_sample_command.py",
     "no sample: operator … succeeded … of … times; give more time with --time-budget": "a run that succeeds too late",
     "… lacks …, expected every key of schema …": "in test_samples.py",
+    'a report needs the package matplotlib, install it with: pip install -e ".[report]"': "the tests install it",
+    "the libraries for pictures cannot be imported: …": "a machine without libraries",
+    "…; or do without the picture: --no-picture": "a machine without libraries",
+    "…: … can collide and has no enclosing primitive; expected meshes, cylinders, ellipsoids or …": "needs a height field",
+    "only … of … random configurations bring the tool near the table without a collision; …": "a search, too slow here",
+    "the robot's links give no model: …": "no file that compiles is known to lead there",
+    "no sample of … in … s, expected …": "a measurement",
+    "… failed with status …: …": "a measurement",
+    "… ended with status …: …": "a measurement",
 }
 
 
 def load_script(name):
     spec = importlib.util.spec_from_file_location(f"{name}_command", ROOT / "scripts" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
@@ -48,7 +62,8 @@ def command_lines(folder):
     yield "--scene bananna"
     yield "--scene nowhere/task.toml"
     for options in (
-        "--instance 8", "--time-budget 0", "--coverage-gain 2", "--batch-size many", "--seed -1", "--speed 9",
+        "--instance 8", "--time-budget 0", "--c-uct 0", "--collisions during", "--check --report", "--coverage-gain 2",
+        "--batch-size many", "--seed -1", "--speed 9",
         "--method greedy", "--method tree-warm", "--method rand --warm-start x.json", "--warm-start nowhere.json",
         "--method tree-warm --warm-start list.json", "--method t;q1", "--method (t,q1;q2", "--method q1;t;q2",
         "--out file/out",
@@ -86,6 +101,12 @@ def calls(folder):
     at = problem("pick_place")
     nothing = lambda **_: jnp.zeros(1)  # noqa: E731
     yield lambda: list(cgs_jax.stream(at, time_budget=-1))
+    yield lambda: list(cgs_jax.stream(at, num_samples=0))
+    yield lambda: list(cgs_jax.stream(at, coverage_gain=1.0))
+    yield lambda: problems.with_collisions(at, "during")
+    yield lambda: cgs_jax.with_constraint(at, "Low", (), nothing, "equality", 1)
+    in_single = lambda t: jax.lax.add(t[:1], jnp.ones(1, jnp.float32))  # noqa: E731
+    yield lambda: cgs_jax.with_constraint(at, "Low", ("t",), in_single, "equality", 1)
     yield lambda: cgs_jax.with_constraint(at, "Grasp(t)", ("t",), nothing, "equality", 1)
     yield lambda: cgs_jax.with_constraint(at, "Low", ("t",), nothing, "about", 1)
     yield lambda: cgs_jax.with_constraint(at, "Low", ("t",), nothing, "equality", 0)
@@ -97,6 +118,16 @@ def calls(folder):
     yield lambda: cgs_jax.with_variable(at, "t", 1, 0.0, 1.0)
     yield lambda: cgs_jax.with_variable(at, "one two", 1, 0.0, 1.0)
     yield lambda: cgs_jax.with_variable(at, "force", 1, 2.0, 1.0)
+    yield lambda: cgs_jax.with_variable(at, "force", 0, 0.0, 1.0)
+    yield lambda: cgs_jax.with_variable(at, "force", 2, [0.0, 0.0, 0.0], 1.0)
+    yield lambda: cgs_jax.with_variable(at, "force", 1, 0.0, float("inf"))
+    yield lambda: cgs_jax.with_sampler(at, (), lambda key: ())
+    yield lambda: cgs_jax.with_sampler(at, "q1", lambda key, q1: q1, given=("q1",))
+    yield lambda: cgs_jax.with_sampler(at, "q1", lambda key: jnp.full(7, jnp.nan))
+    yield lambda: cgs_jax.with_sampler(at, "q1", lambda key: jnp.full(7, 99.0))
+    yield lambda: cgs_jax.with_sampler(at, "t", lambda key: jnp.ones(7))
+    for cost in (lambda q9: q9[0], lambda q1: q1[0] + jnp.ones(3) @ q1, lambda q1: q1):
+        yield lambda cost=cost: cgs_jax.operator(at, given=("t",), new=("q1",), cost=cost)
     drawn = cgs_jax.with_sampler(at, "q1", lambda key: jnp.zeros(7) + jnp.array([0, 0, 0, -1.5, 0, 1.5, 0]))
     yield lambda: cgs_jax.with_sampler(drawn, "q1", lambda key: jnp.zeros(7))
     yield lambda: cgs_jax.with_sampler(at, "q1", lambda: jnp.zeros(7))
@@ -132,6 +163,77 @@ def calls(folder):
     yield no_operator_ran
 
 
+def reports(folder):
+    """Mistakes in the folder of a run."""
+    for name, run in (("none", None), ("list", "[]"), ("short", "{}")):
+        (folder / name).mkdir()
+        if run is not None:
+            for file in ("run.json", "tree.json"):
+                (folder / name / file).write_text(run)
+        yield lambda name=name: report.save_report(folder / name)
+    show = load_script("show")
+    one = {"sequences": ("q",), "sequence": np.zeros(0, int), "elapsed": np.zeros(0), "violation": np.zeros((0, 0))}
+    SampleSet("<mujoco/>", {"q": np.zeros((0, 2))}, ("pick",), np.zeros((0, 1, 1)), **one).save(folder / "empty.npz")
+    yield lambda: show.show(show.parse().parse_args([str(folder / "empty.npz")]))
+
+
+def other_sources():
+    """What a worker answers to a process that loaded other sources."""
+    answer = io.BytesIO()
+    worker.serve(io.BytesIO(pickle.dumps("other")), answer)
+    raise pickle.loads(answer.getvalue())
+
+
+def robots(folder):
+    """Mistakes in calls of import_robot.py and in the robot's file."""
+    command = load_script("import_robot")
+    arm = "<geom name='rod' type='capsule' size='.05 .1'/><site name='tip'/>"
+    turning = f"<body name='arm'><joint name='turn' axis='0 0 1' range='-1 1'/>{arm}</body>"
+    toy = lambda body: f"<mujoco><compiler angle='radian'/><worldbody>{body}</worldbody></mujoco>"  # noqa: E731
+    files = {
+        "good": toy(turning),
+        "broken": "<mujoco",
+        "other": "<sdf/>",
+        "wrong": toy("<geom type='spere'/>"),
+        "fixed": toy(f"<body name='arm'>{arm}</body>"),
+        "ball": toy(turning.replace("axis='0 0 1' range='-1 1'", "type='ball'")),
+        "slide": toy(turning.replace("range='-1 1'", "type='slide'")),
+        "meshes": "<robot name='r'><link name='arm'><collision><geometry><mesh filename='no.stl'/></geometry></collision>"
+        "</link></robot>",
+    }
+    for name, text in files.items():
+        (folder / f"{name}.xml").write_text(text)
+    (folder / "taken").mkdir()
+    (folder / "taken" / "taken.xml").write_text("")
+    for name, options in (
+        ("good", "--home turn"), ("good", "--home turn=far"), ("good", "--shape rod=round"), ("good", "--flange tip"),
+        ("good", "--out 7up"), ("good", "--out taken"), ("nowhere", ""), ("broken", ""), ("other", ""), ("wrong", ""),
+        ("meshes", ""), ("good", "--approach w"), ("good", ""), ("good", "--tool arm:1,2"), ("good", "--tool hand"),
+        ("fixed", "--tool tip"), ("ball", "--tool tip"), ("slide", "--tool tip"), ("good", "--home twist=1"),
+        ("good", "--tool tip --home turn=9"), ("good", "--shape hand=box"), ("good", "--tool tip --shape rod=halves"),
+        ("good", "--tool tip --grasp two_finger"),
+    ):  # fmt: skip
+        line = f"{name}.xml --out fresh --no-picture {options}".split()
+        yield lambda line=line: command.write(command.parser().parse_args(line))
+
+
+def measurements(folder):
+    """Mistakes in calls of benchmark.py."""
+    command = load_script("benchmark")
+    for line in ("speed", "--peer-scenes mars", "--seconds 0", "--results x.json"):
+        yield lambda line=line: command.check(command.parse().parse_args(line.split()))
+    yield lambda: command.read_result(folder / "nowhere.json")
+    yield lambda: command.read_result(folder / "list.json")
+    nothing = {"schema": command.SCHEMA, "parts": {}}
+    yield lambda: command.compare(nothing, nothing, 0.85)
+
+    def more_cores_than_there_are():
+        with command.on_cores(10**6):
+            pass
+
+    yield more_cores_than_there_are
+
+
 @pytest.fixture(scope="module")
 def messages(tmp_path_factory):
     """Every message that the mistakes lead to."""
@@ -156,7 +258,7 @@ def messages(tmp_path_factory):
             assert before in text
             (scene / path.split("/")[1]).write_text(text.replace(before, after))
             note(lambda scene=scene, name=name: cgs_jax.load_problem(scene / f"{name}.toml"))
-        for call in calls(folder):
+        for call in (*calls(folder), *reports(folder), other_sources, *robots(folder), *measurements(folder)):
             note(call)
     return found
 
