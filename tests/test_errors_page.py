@@ -40,6 +40,7 @@ UNTRIED = {
     "no sample of … in … s, expected …": "a measurement",
     "… failed with status …: …": "a measurement",
     "… ended with status …: …": "a measurement",
+    "… holds runs of another budget or other settings, choose another folder": "in test_reproduce.py",
 }
 
 
