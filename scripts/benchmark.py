@@ -176,15 +176,18 @@ def best_sequence(problem: Problem, seconds: float, seed: int = 0) -> str:
 
 @contextlib.contextmanager
 def on_cores(count: int) -> Iterator[None]:
-    """Keeps every thread of this process on the first `count` cores that it may use (Linux)."""
+    """Keeps every thread of this process, and of the workers that wait in it, on the first `count` of its cores (Linux)."""
     allowed = sorted(os.sched_getaffinity(0))
     if count > len(allowed):
         raise InputError(f"{count} cores asked for, {len(allowed)} available")
 
     def place(cores: Sequence[int]) -> None:
-        for thread in os.listdir("/proc/self/task"):
-            with contextlib.suppress(ProcessLookupError):  # it ended meanwhile
-                os.sched_setaffinity(int(thread), cores)
+        own = Path("/proc/self/task")
+        children = {child for task in own.iterdir() for child in (task / "children").read_text().split()}
+        for process in (own, *(Path("/proc", child, "task") for child in children)):
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it ended meanwhile
+                for thread in os.listdir(process):
+                    os.sched_setaffinity(int(thread), cores)
 
     place(allowed[:count])
     try:
@@ -1202,7 +1205,7 @@ def machine() -> dict[str, Any]:
         "cpu": model,
         "cores": len(os.sched_getaffinity(0)),
         "memory_bytes": memory,
-        "system": f"{platform.system()} {platform.release()}",
+        "system": f"{platform.system()} {platform.machine()}",
     }
 
 

@@ -93,10 +93,11 @@ def test_without_pools_the_same_samples_are_valid():
     assert sum(len(event.qpos) for event in of(Found, events)) == 20
 
 
-def test_samples_are_neither_piled_on_limits_nor_on_each_other(fixed):
+def test_samples_are_neither_piled_on_limits_nor_on_each_other():
     low, high = problem("pick_place").params.limits["q1"]
+    found = run(number=600)
     for name in ("q1", "q2"):
-        q = np.concatenate([event.values[name] for event in of(Found, fixed)])
+        q = np.concatenate([event.values[name] for event in of(Found, found)])
         at_limit = (np.minimum(q - low, high - q) < 1e-3 * (high - low)).any(axis=1)
         assert at_limit.mean() < 0.05
         near = [np.abs(a - b).max() < 1e-2 for a, b in itertools.combinations(q, 2)]
