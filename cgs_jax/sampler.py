@@ -16,6 +16,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -165,6 +166,12 @@ BATCH_SECONDS = 0.04
 LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
+PATIENCE = 2
+"""Batches that may be spent on the step after one that was looked at for the first time,"""
+
+FEW_HISTORIES = 3
+"""while its operator ran after fewer histories than this: the tree judges it by the others."""
+
 FIRST_GUESS = 6e-8
 """Device seconds per task or iteration and squared unknown, before anything has run."""
 
@@ -214,15 +221,18 @@ class _Pace:
         self._all = 0.0, 0.0
         self._work_per_task: dict[int, float] = {}
 
-    def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float) -> float:
-        """Device seconds to charge for a batch, whose measured time is taken into account."""
+    def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float, look: bool) -> float:
+        """Device seconds to charge for a batch, whose measured time is taken into account unless it is a first look.
+
+        Looks run in the scheduling process, beside the workers: three on two cores.
+        """
         program, work = operator.plan.layout, (tasks + iterations) * _squared_unknowns(operator)
-        if tasks >= REPRESENTATIVE:
+        if tasks >= REPRESENTATIVE and not look:
             self._programs[program] = _mixed(self._programs.get(program, (0.0, 0.0)), measured, work, tasks)
             self._all = _mixed(self._all, measured, work, tasks)
         known = self._work_per_task.get(operator.identity, work / tasks)
         self._work_per_task[operator.identity] = 0.7 * known + 0.3 * work / tasks
-        return self._unit(program) * work or measured
+        return (self._unit(program) or FIRST_GUESS) * work
 
     def _unit(self, program: Any) -> float:
         seconds, work = self._programs.get(program, self._all)
@@ -232,7 +242,7 @@ class _Pace:
         """Expected device seconds per task of a large batch."""
         # Before its first batch: about seven iterations.
         work = self._work_per_task.get(operator.identity, 8.0 * _squared_unknowns(operator))
-        return work * (self._unit(operator.plan.layout) or FIRST_GUESS)
+        return (self._unit(operator.plan.layout) or FIRST_GUESS) * work
 
 
 def _mixed(known: tuple[float, float], seconds: float, work: float, tasks: int) -> tuple[float, float]:
@@ -335,6 +345,9 @@ class Sampler:
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
         self._pace = _Pace()
+        self._made: defaultdict[int, set[History]] = defaultdict(set)  # by operator
+        self._pursued: Path = ()
+        self._patience = 0
         self._announced: set[int] = set()
         self._full = problem.transitions.full
         self._stop = threading.Event()
@@ -511,7 +524,14 @@ class Sampler:
                     program.reported = True
                     yield Compiled(program.name, program.seconds)
 
-    def _next_job(self) -> _Job | None:
+    def _choose(self) -> Path:
+        """The sequence to work on; () while none is ready. After a first look at a step the next one is looked at too.
+
+        What that is worth may depend on how its inputs came about as much as tenfold, and nothing else would show it.
+        """
+        if self._patience > 0:
+            self._patience -= 1
+            return self._pursued
         if self.settings.deterministic:
             path = self.chooser.select(None)
             for step in self._steps_of(path):
@@ -519,8 +539,13 @@ class Sampler:
                     future.result()
         else:
             path = self.chooser.select(self._ready)
-            if not path:
-                return None
+        self._pursued = path
+        return path
+
+    def _next_job(self) -> _Job | None:
+        path = self._choose()
+        if not path:
+            return None
         steps = self._steps_of(path)
         makers = {step.makes: position for position, step in enumerate(steps)}
         ends = (steps[-1].makes, *self._final_histories(path))
@@ -540,6 +565,12 @@ class Sampler:
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
                 count = most
+                self._made[step.operator.identity].add(slot)
+                if visits == 0 and position + 1 < len(steps):
+                    known = len(self._made[steps[position + 1].operator.identity])
+                    self._patience = PATIENCE if known < FEW_HISTORIES else 0
+                elif not young:
+                    self._patience = 0
                 self._visits[slot] = self._visits.get(slot, 0) + 1
                 return self._job(path, position, step, waiting, count, young)
             position = makers[scarcest]
@@ -606,7 +637,7 @@ class Sampler:
         )
         audited = outcome.audited
         operator = job.step.operator
-        seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds)
+        seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds, job.look)
         allowed = self.settings.tries if job.step.reads else 1
         attempts = np.bincount(job.tries, minlength=allowed)
         successes = np.bincount(job.tries[success], minlength=allowed)
