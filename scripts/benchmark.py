@@ -183,7 +183,10 @@ def on_cores(count: int) -> Iterator[None]:
 
     def place(cores: Sequence[int]) -> None:
         own = Path("/proc/self/task")
-        children = {child for task in own.iterdir() for child in (task / "children").read_text().split()}
+        children: set[str] = set()
+        for task in own.iterdir():
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+                children.update((task / "children").read_text().split())
         for process in (own, *(Path("/proc", child, "task") for child in children)):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it ended meanwhile
                 for thread in os.listdir(process):
