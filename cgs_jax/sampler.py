@@ -167,10 +167,10 @@ LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
 PATIENCE = 2
-"""Batches that may be spent on the step after one that was looked at for the first time,"""
+"""Batches that may be spent on the step after one that was looked at for the first time."""
 
 FEW_HISTORIES = 3
-"""while its operator ran after fewer histories than this: the tree judges it by the others."""
+"""Only while that step's operator ran after fewer histories than this: the tree judges it by those alone."""
 
 FIRST_GUESS = 6e-8
 """Device seconds per task or iteration and squared unknown, before anything has run."""

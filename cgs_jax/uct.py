@@ -54,7 +54,7 @@ CORRELATION_TRIES = 1000.0
 """Weight of that guess, in tries."""
 
 OPERATOR_TIME_TRIES = 300.0
-"""The same for the time of a try, which varies less from history to history."""
+"""A history believes its operator's pooled time of a try as if it had seen so many: it varies less than success."""
 
 VISIT_TRIES = 32
 """Smaller batches count as visits in proportion."""
@@ -92,7 +92,9 @@ class Statistics:
     successes: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
-    def add(self, visits: float, attempts: Sequence[float], successes: Sequence[float], seconds: float, keep: float = 1.0):
+    def add(
+        self, visits: float, attempts: Sequence[float], successes: Sequence[float], seconds: float, keep: float = 1.0
+    ) -> None:
         """Discount what is known by the factor `keep` and add a batch."""
         more = len(attempts) - len(self.attempts)
         if more > 0:
@@ -282,7 +284,7 @@ class _Edge:
 class _Node:
     """Assigned variables and how their components came about: all sequences that lead there."""
 
-    __slots__ = ("components", "edges", "reach", "state", "value", "version", "visited")
+    __slots__ = ("components", "edges", "epoch", "reach", "state", "value", "visited")
 
     def __init__(self, state: State, components: tuple[_History, ...]) -> None:
         self.state = state
@@ -291,7 +293,7 @@ class _Node:
         self.visited = False  # a recorded sequence passed through
         self.value = 0.0
         self.reach = 0.0
-        self.version = -1
+        self.epoch = -1
 
 
 class _Records:
@@ -703,6 +705,7 @@ class Tree(_Records):
         self._below: dict[State, tuple[float, float] | None] = {}  # value and reach by state, from operators alone
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
+        self._epoch = 0  # of the values: they change with the price too
         self._edges_evaluated = 0
         self._records_since_refresh = 0
         self._stale = True
@@ -866,9 +869,10 @@ class Tree(_Records):
         """Recompute all predictions: operators, values by state, and the tree."""
         self._predict_operators()
         self._attainable = 0.0
-        self._edges_evaluated = 0
+        if self._states is None:
+            self._per_variable = self._share_among_variables()
         self._value_at(self.price)
-        for _ in range(PRICE_STEPS):
+        for _ in range(PRICE_STEPS if self.reward == "rate" else 0):
             attainable = self._rate_of_the_best()
             if attainable <= 1.1 * self.price:
                 break
@@ -879,12 +883,11 @@ class Tree(_Records):
 
     def _value_at(self, price: float) -> None:
         """Values of all states and nodes at a price of time."""
-        self._version += 1
+        self._epoch += 1
+        self._edges_evaluated = 0
         self._below = {self.transitions.full: (1.0, 1.0)}
         if self._states is not None:
             self._solve_states(price)
-        else:
-            self._per_variable = self._share_among_variables()
         self._evaluate(self._root, price)
 
     def _rate_of_the_best(self) -> float:
@@ -900,7 +903,7 @@ class Tree(_Records):
 
     def _evaluate(self, node: _Node, price: float) -> None:
         """Values of the visited part of the tree, by its histories; of its leaves, by their states."""
-        node.version = self._version
+        node.epoch = self._epoch
         edges = self._expand(node)
         for edge in edges:
             self._evaluate_edge(edge, price)
@@ -912,7 +915,7 @@ class Tree(_Records):
             edge.node = self._nodes.get(frozenset((*edge.kept, edge.history)))
         node = edge.node
         if node is not None and node.visited and node.state != self.transitions.full:
-            if node.version != self._version:
+            if node.epoch != self._epoch:
                 self._evaluate(node, price)
             edge.value, reach = node.value, node.reach
         else:

@@ -60,12 +60,14 @@ class Worker:
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
         self._send(SOURCES)
+        self._failed = False
         self._installed: set[int] = set()
         self._sent: set[int] = set()
 
     @property
-    def alive(self) -> bool:
-        return self._process.poll() is None
+    def usable(self) -> bool:
+        """Whether it runs and no answer of it may be on its way: after a failure its next one may belong to anything."""
+        return not self._failed and self._process.poll() is None
 
     def begin(self, setup: Setup) -> None:
         """Starts on a problem; `await_ready` tells when it can take batches. Programs that were sent before stay."""
@@ -112,6 +114,7 @@ class Worker:
         except (EOFError, OSError) as error:
             raise RuntimeError(f"a worker process ended: {error}") from error
         if isinstance(answer, BaseException):
+            self._failed = True
             raise answer
         return answer
 
@@ -135,7 +138,7 @@ def hire(setup: Setup) -> Worker:
     """A worker for a run: one that an earlier run of this process left, or a new one."""
     while _idle:
         worker = _idle.pop()
-        if worker.alive:
+        if worker.usable:
             worker.begin(setup)
             return worker
         worker.close()
@@ -146,7 +149,7 @@ def hire(setup: Setup) -> Worker:
 
 def dismiss(worker: Worker) -> None:
     """Keeps a worker that waits for work until the next run; it ends with this process. One is kept for each core."""
-    if worker.alive and len(_idle) < (os.cpu_count() or 1):
+    if worker.usable and len(_idle) < (os.cpu_count() or 1):
         _idle.append(worker)
     else:
         worker.close()

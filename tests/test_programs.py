@@ -147,7 +147,18 @@ def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
     for seed in range(2):
         cgs_jax.sample(at, time_budget=60.0, num_samples=40_000, seed=seed, method="expert3")
         seen.append({one._process.pid for one in worker._idle})
-        assert all(one.alive for one in worker._idle)
+        assert all(one.usable for one in worker._idle)
     assert seen[0] and seen[0] <= seen[1]
     for one in worker._idle:
         one.close()
+
+
+def test_a_worker_that_failed_is_not_kept(monkeypatch):
+    monkeypatch.setattr(worker, "_idle", [])
+    at, batch = grasps()
+    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None))
+    assert one.await_ready()
+    with pytest.raises(Exception, match="object"):
+        one.run("no batch")
+    worker.dismiss(one)
+    assert worker._idle == [] and one._process.poll() is not None
