@@ -23,6 +23,7 @@ from cgs_jax.keyframes import Keyframes
 from cgs_jax.operators import (
     PENETRATION,
     Operator,
+    aimed_at,
     clearance_program,
     gather_given,
     gather_poses,
@@ -32,9 +33,13 @@ from cgs_jax.operators import (
 from cgs_jax.own import own_checks
 from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.scene import attachments, goals, placements
+from cgs_jax.tables import SeedTable
 from cgs_jax.transitions import Transition
 
 Values = dict[str, np.ndarray]
+
+AimedTables = list[SeedTable | None]
+"""For each new configuration of an operator."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,7 @@ class BatchRunner:
         self._seed = seed
         self._numbers: dict[Any, Any] = {}
         self._requested: dict[int, list[Future]] = {}
+        self._aimed: dict[int, AimedTables] = {}
         self._lock = threading.Lock()
 
     # -------------------------------------------------------------- programs
@@ -120,6 +126,20 @@ class BatchRunner:
             if operator.identity not in self._requested:
                 self._requested[operator.identity] = self._programs(operator)
             return self._requested[operator.identity]
+
+    def is_aimed(self, operator: Operator) -> bool:
+        """Whether the seed tables of an operator have been made."""
+        return operator.identity in self._aimed
+
+    def aimed(self, operator: Operator) -> AimedTables:
+        """Seed tables of an operator, made on first request (see `tables`)."""
+        if operator.identity not in self._aimed:
+            self._aimed[operator.identity] = aimed_at(self.problem, operator)
+        return self._aimed[operator.identity]
+
+    def take_aimed(self, identity: int, aimed: AimedTables) -> None:
+        """Gives an operator seed tables that were made elsewhere."""
+        self._aimed[identity] = aimed
 
     def install(self, identity: int, ready: list[programs.Program]) -> None:
         """Gives an operator programs that were compiled elsewhere."""
@@ -163,7 +183,9 @@ class BatchRunner:
         layout = operator.plan.layout
         given = np.zeros((batch, layout.given, 7), np.float32)
         of_function = self._blank_configurations(operator.plan.given_configurations)
-        arguments = (self._key_of(operator), np.uint32(0), scalar, given, of_function, self._numbers_of(operator))
+        # Of the shapes of what `_numbers_of` makes later.
+        numbers = operator.numbers(self.problem.params)
+        arguments = (self._key_of(operator), np.uint32(0), scalar, given, of_function, numbers)
         name = f"solve {layout.configurations} configurations, {layout.free} free poses"
         if operator.inside:
             name += f", {', '.join(operator.inside)}"
@@ -184,7 +206,8 @@ class BatchRunner:
     def _numbers_of(self, what: Any) -> Any:
         key = what.identity if isinstance(what, Operator) else what.constraint
         if key not in self._numbers:
-            self._numbers[key] = jax.device_put(what.numbers(self.problem.params))
+            aimed = (self.aimed(what),) if isinstance(what, Operator) else ()
+            self._numbers[key] = jax.device_put(what.numbers(self.problem.params, *aimed))
         return self._numbers[key]
 
     def _key_of(self, operator: Operator) -> np.ndarray:

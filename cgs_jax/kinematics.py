@@ -161,19 +161,29 @@ class ChainReader:
 
 def tool_poses_on_host(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tools in the root frame in numpy and the precision of the input: q `(lanes, n)` -> `(lanes, 3, 3)`, `(lanes, 3)`."""
-    lanes, joints = q.shape[0], chain.offset.shape[0]
-    rotation, position = np.tile(np.eye(3), (lanes, 1, 1)), np.zeros((lanes, 3))
-    move = q[:, :joints] - chain.reference
+    joints = chain.offset.shape[0]
+    move = q[:, :joints].T - np.asarray(chain.reference)[:, None]
+    kind = np.result_type(move, np.float32)
+    # Lanes last, as on the device: products of whole rows.
+    rotation = np.zeros((3, 3, len(q)), kind)
+    rotation[[0, 1, 2], [0, 1, 2]] = 1.0
+    position = np.zeros((3, len(q)), kind)
     for i in range(joints):
-        position = position + rotation @ chain.offset[i]
-        rotation = rotation @ chain.rotation[i]
-        c, s = np.cos(move[:, i] * chain.hinge[i]), np.sin(move[:, i] * chain.hinge[i])
-        position = position + rotation[:, :, 2] * (move[:, i] * chain.slide[i])[:, None]
-        x, y = rotation[:, :, 0] * c[:, None], rotation[:, :, 1] * c[:, None]
-        rotation = np.stack(
-            [x + rotation[:, :, 1] * s[:, None], y - rotation[:, :, 0] * s[:, None], rotation[:, :, 2]], axis=2
-        )
-    return rotation @ chain.tool_rotation, position + rotation @ chain.tool_offset
+        position, rotation = _moved(rotation, position, chain.rotation[i], chain.offset[i])
+        c, s = np.cos(move[i] * chain.hinge[i]), np.sin(move[i] * chain.hinge[i])
+        position = position + rotation[:, 2] * (move[i] * chain.slide[i])
+        x, y = rotation[:, 0], rotation[:, 1]
+        rotation = np.stack([x * c + y * s, y * c - x * s, rotation[:, 2]], axis=1)
+    position, rotation = _moved(rotation, position, chain.tool_rotation, chain.tool_offset)
+    return np.moveaxis(rotation, 2, 0), position.T
+
+
+def _moved(
+    rotation: np.ndarray, position: np.ndarray, by_rotation: Array, by_offset: Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and rotation of frames `(3, 3, lanes)`, `(3, lanes)` after a constant transform in them."""
+    turn, offset = np.asarray(by_rotation, rotation.dtype), np.asarray(by_offset, rotation.dtype)
+    return position + np.einsum("ij...,j->i...", rotation, offset), np.matmul(turn.T, rotation)
 
 
 # ------------------------------------------------------------------ device: evaluating them

@@ -28,6 +28,7 @@ from cgs_jax.plans import Layout, Plan, PlanSystem, Point, Shared, Tasks, make_p
 from cgs_jax.poses import Array, Pose, compose, from_vector, inverse, to_vector
 from cgs_jax.problems import Params, Problem
 from cgs_jax.seeds import PoseSeed, SiteChoices, Tables, count_draws, draw, draw_own, pose_seed, uniforms
+from cgs_jax.tables import SeedTable, Sources, aimed_tables
 from cgs_jax.transitions import Transition
 
 PENETRATION = 5e-5
@@ -301,8 +302,8 @@ class Operator:
     identity: int
     """Number that separates its random streams from other operators'."""
 
-    def numbers(self, params: Params) -> Numbers:
-        """The unchanging arguments of `propose`."""
+    def numbers(self, params: Params, aimed: Sequence[SeedTable | None] = ()) -> Numbers:
+        """The unchanging arguments of `propose`; `aimed` has seed tables that take the place of the robots' plain ones."""
         layout, plan = self.plan.layout, self.plan
         chains = [
             padded(params.chains[name] if name else _NO_CHAIN, layout.joints)
@@ -311,6 +312,8 @@ class Operator:
         ]
         limits = [params.limits[name] for name in plan.configurations]
         tables = [params.tables[name] for name in self.tables]
+        if aimed:
+            tables = [own or plain for own, plain in zip(aimed, tables, strict=True)]
         size = tables[0].configurations.shape[-1] if tables else 1
         tools = [
             table.tools[name] if name else _still_tool(size)
@@ -451,6 +454,17 @@ def _bind(problem: Problem, transition: Transition) -> Operator:
         dofs=tuple(problem.dofs[name] or 0 for name in plan.configurations),
         identity=zlib.crc32(repr(transition.problem).encode()),
     )
+
+
+def aimed_at(problem: Problem, operator: Operator) -> list[SeedTable | None]:
+    """Seed tables for the operator's new configurations, made for the problem's own numbers (host work)."""
+    params = problem.params
+    seed_of: dict[str, str] = {}
+    for name, declaration in problem.declarations.items():
+        if name in params.seeds:
+            seed_of.setdefault(declaration.scope[0], name)
+    pools = {name: problem.pools[table] for name, table in problem.table_of.items() if table in problem.pools}
+    return aimed_tables(operator.plan, Sources(params.constants, params.rows, params.seeds, params.sites, seed_of, pools))
 
 
 def _widths(low: Array, high: Array) -> tuple[float, ...]:

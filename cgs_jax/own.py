@@ -18,7 +18,8 @@ from cgs_jax.audit import OwnCheck
 from cgs_jax.constraints import Function, OwnSampler
 from cgs_jax.errors import InputError
 from cgs_jax.graph import Constraint, Variable
-from cgs_jax.problems import TABLE_SIZE, Problem, RobotTable
+from cgs_jax.problems import Problem
+from cgs_jax.tables import TABLE_SIZE, SeedTable
 
 TRIALS = 64
 """Draws by which a sampler is tried out."""
@@ -95,7 +96,7 @@ def with_variable(
     params = problem.params._replace(
         limits={**problem.params.limits, name: limits},
         # Seeds of vectors are uniform; the table only has to have everyone's shape.
-        tables={**problem.params.tables, table: RobotTable(np.zeros((dof, TABLE_SIZE), np.float32), {})},
+        tables={**problem.params.tables, table: SeedTable(np.zeros((dof, TABLE_SIZE), np.float32), {})},
     )
     table_of = {**problem.table_of, name: table}
     return dataclasses.replace(problem, graph=graph, params=params, table_of=table_of, operators={}, source=None)

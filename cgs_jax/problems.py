@@ -35,24 +35,14 @@ from cgs_jax.constraints import (
 from cgs_jax.errors import InputError
 from cgs_jax.graph import Constraint, ConstraintGraph, Variable
 from cgs_jax.kinematics import Chain, ChainReader
-from cgs_jax.poses import Array, Pose
+from cgs_jax.poses import Array
 from cgs_jax.scene import Hold, Robot, Scene, TouchGrasp, TwoFingerGrasp, load_scene, object_pose_sources
 from cgs_jax.seeds import PoseSeed, pose_seed
+from cgs_jax.tables import Pool, SeedTable
 from cgs_jax.transitions import Transitions
-
-TABLE_SIZE = 4096
-"""Entries of a seed table."""
-
 
 Collisions = Literal["after", "inside"]
 """Where clearances are seen to: after the solver, where they reject, or inside it, as a row for the nearest pair of each."""
-
-
-class RobotTable(NamedTuple):
-    """Seed table of one robot: random configurations without collision with itself and the fixed world."""
-
-    configurations: Array  # (dof, T)
-    tools: dict[str, Pose]  # chain name -> (3, 3, T), (3, T) in the chain's root frame
 
 
 class Params(NamedTuple):
@@ -65,7 +55,7 @@ class Params(NamedTuple):
     seeds: dict[str, PoseSeed]  # by constraint on one pose alone
     sites: dict[str, Array]  # by constraint of touch: (sites, 7) T_object_site
     clearances: dict[str, ClearanceData]  # by constraint
-    tables: dict[str, RobotTable]  # "robot" or "robot, hanging"; by name for a vector variable, whose entries are not used
+    tables: dict[str, SeedTable]  # "robot" or "robot, hanging"; by name for a vector variable, whose entries are not used
 
 
 class Exact(NamedTuple):
@@ -93,6 +83,8 @@ class Problem:
     """(floating robot, switch) to the pose of its base as a product."""
     params: Params
     exact: Exact
+    pools: Mapping[str, Pool]
+    """By seed table of a robot: the configurations that tables are made of."""
     collisions: Collisions = "after"
     """Whether clearances are checked after the solver, or kept inside it."""
     source: tuple[str, int] | None = None
@@ -311,6 +303,7 @@ class _Builder:
             for switch in task.switches
             for robot, name in switch.configurations.items()
         }
+        pools = {name: self.pool(name) for name in sorted(set(table_of.values()))}
         params = Params(
             constants=self.constants,
             chains=self.chains,
@@ -319,7 +312,7 @@ class _Builder:
             seeds=self.seeds,
             sites=self.sites,
             clearances=clearance_data,
-            tables={name: self.table(name) for name in sorted(set(table_of.values()))},
+            tables={name: pool.plain for name, pool in pools.items()},
         )
         return Problem(
             scene=self.scene,
@@ -331,6 +324,7 @@ class _Builder:
             base_poses=base_poses,
             params=_single_precision(params),
             exact=Exact(self.constants, self.chains),
+            pools=pools,
         )
 
     def limits(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -435,7 +429,7 @@ class _Builder:
 
     # -------------------------------------------------------------- seed tables
 
-    def table(self, name: str) -> RobotTable:
+    def pool(self, name: str) -> Pool:
         """Random configurations that collide with nothing that is always there: the robot itself and, standing, the world."""
         robot = self.task.robot(name.split(",")[0])
         hangs = name != robot.name
@@ -443,39 +437,20 @@ class _Builder:
         mine = np.array([reader.link_of_body(int(b)) is not None for b in self.model.geom_bodyid])
         fixed = (self.model.body_weldid[self.model.geom_bodyid] == 0) & (not hangs)
         counted = mine | fixed
-        frames = [key.split("/")[1] for key in self.chains if key.split("/")[0] == robot.name]
-        sites = [self.model.site(frame).id for frame in frames]
-        low, high = self.limits(robot)
-        rng = np.random.default_rng(0)
         data = mujoco.MjData(self.model)
         data.qpos[:] = self.scene.home_qpos
-        root = (np.eye(3), np.zeros(3))
-        if robot.base is not None:
-            root = _matrix(self.scene.object_pose(robot.base))
-        kept = np.empty((TABLE_SIZE, len(robot.joints)))
-        rotations = np.empty((len(sites), TABLE_SIZE, 3, 3))
-        positions = np.empty((len(sites), TABLE_SIZE, 3))
-        count = tried = 0
-        while count < TABLE_SIZE:
-            q = rng.uniform(low, high)
+
+        def is_free(q: np.ndarray) -> bool:
             data.qpos[reader.qpos_addresses] = q
             mujoco.mj_kinematics(self.model, data)
-            tried += 1
-            # Where nearly everything collides, colliding entries are better than none.
-            if tried < 20 * TABLE_SIZE:
-                mujoco.mj_collision(self.model, data)
-                pairs = data.contact.geom[: data.ncon]
-                if data.ncon and np.any(counted[pairs].all(axis=1) & (data.contact.dist[: data.ncon] < 0)):
-                    continue
-            kept[count] = q
-            for i, site in enumerate(sites):
-                rotations[i, count] = root[0].T @ data.site_xmat[site].reshape(3, 3)
-                positions[i, count] = root[0].T @ (data.site_xpos[site] - root[1])
-            count += 1
-        tools = {
-            f"{robot.name}/{frame}": Pose(np.moveaxis(rotations[i], 0, 2), positions[i].T) for i, frame in enumerate(frames)
-        }
-        return RobotTable(kept.T, tools)
+            mujoco.mj_collision(self.model, data)
+            if not data.ncon:
+                return True
+            contact = data.contact
+            return not np.any(counted[contact.geom].all(axis=1) & (contact.dist < 0))
+
+        chains = {key: chain for key, chain in self.chains.items() if key.split("/")[0] == robot.name}
+        return Pool(*self.limits(robot), chains, is_free)
 
 
 def _body_variables(body: Body) -> set[str]:

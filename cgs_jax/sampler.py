@@ -298,7 +298,14 @@ class _Crew:
         """Runs a batch on whoever is free; a first look at an operator here, where its programs are loaded already."""
         if self._refusal is not None:
             raise self._refusal
+        operator = operator_of(self._local.problem, batch.transition)
         if look:
+            if not self._local.is_aimed(operator):
+                member = self._free.get()
+                try:
+                    self._aim(member, operator, batch.transition)
+                finally:
+                    self._free.put(member)
             return self._local.run(batch)
         member = self._free.get()
         # With all workers there, this process has its core for compiling and deciding.
@@ -306,11 +313,17 @@ class _Crew:
             member = self._free.get()
         try:
             if isinstance(member, Worker):
-                operator = operator_of(self._local.problem, batch.transition)
-                member.install(operator.identity, [future.result() for future in self._local.request(operator)])
+                self._aim(member, operator, batch.transition)
+                ready = [future.result() for future in self._local.request(operator)]
+                member.install(operator.identity, ready, self._local.aimed(operator))
             return member.run(batch)
         finally:
             self._free.put(member)
+
+    def _aim(self, member: BatchRunner | Worker, operator: Operator, transition: Transition) -> None:
+        """Sees to it that the operator's seed tables are made; once, since whoever runs a batch gets them from here."""
+        if isinstance(member, Worker) and not self._local.is_aimed(operator):
+            self._local.take_aimed(operator.identity, member.aim(transition))
 
     def close(self) -> None:
         """Ends the worker processes, but for those that have arrived and wait: the next run takes them. No batch may run."""

@@ -23,7 +23,7 @@ from cgs_jax.constraints import Form
 from cgs_jax.plans import Layout, Point, Shared, Tasks, Words, all_atoms, tools_at
 from cgs_jax.poses import Array, Pose, compose, from_quaternion, from_vector, inverse, matmul, matvec, rotation_exp, transpose
 
-CANDIDATES = 32
+CANDIDATES = 16
 """Table entries that a configuration is chosen from."""
 JITTER = 0.1
 """Half width, relative to the joint's range, of the uniform offset from a table entry."""

@@ -19,10 +19,12 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from cgs_jax.audit import Tolerances
-from cgs_jax.batches import Batch, BatchRunner, BatchSettings, Outcome
+from cgs_jax.batches import AimedTables, Batch, BatchRunner, BatchSettings, Outcome
 from cgs_jax.errors import InputError
+from cgs_jax.operators import operator_of
 from cgs_jax.problems import load_problem
 from cgs_jax.programs import SOURCES, Program, load_portable
+from cgs_jax.transitions import Transition
 
 ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of a process whose programs run on one thread."""
@@ -40,12 +42,20 @@ class Setup:
 
 
 @dataclass(frozen=True)
+class Aim:
+    """Asks for the seed tables of a transition's operator."""
+
+    transition: Transition
+
+
+@dataclass(frozen=True)
 class Install:
-    """Programs of an operator, as `Program.portable`; those that were sent before are named by their number alone."""
+    """Programs of an operator, as `Program.portable`, those that were sent before by their number alone; its seed tables."""
 
     identity: int
     numbers: tuple[int, ...]
     programs: Mapping[int, bytes]
+    aimed: AimedTables
 
 
 class Worker:
@@ -74,8 +84,8 @@ class Worker:
         self._installed.clear()
         self._send(setup)
 
-    def install(self, identity: int, programs: Sequence[Program]) -> None:
-        """Makes sure that the worker has the programs of an operator; they are compiled in one process only."""
+    def install(self, identity: int, programs: Sequence[Program], aimed: AimedTables) -> None:
+        """Makes sure that the worker has the programs and seed tables of an operator; they are made in one process only."""
         if identity in self._installed:
             return
         self._installed.add(identity)
@@ -84,7 +94,7 @@ class Worker:
         numbers = tuple(program.number for program in programs)
         missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
         self._sent.update(missing)
-        self._send(Install(identity, numbers, missing))
+        self._send(Install(identity, numbers, missing, aimed))
 
     def await_ready(self) -> bool:
         """Waits until it can take batches; False when it ended before. Raises InputError when it runs other sources,
@@ -97,6 +107,10 @@ class Worker:
             raise answer
         return True
 
+    def aim(self, transition: Transition) -> AimedTables:
+        """Makes seed tables there: work of the interpreter, which the other threads of this process would slow down."""
+        return self._ask(Aim(transition))
+
     def _pipe_from(self) -> BinaryIO:
         assert self._process.stdout is not None
         return self._process.stdout  # type: ignore[return-value]
@@ -108,8 +122,11 @@ class Worker:
 
     def run(self, batch: Batch) -> Outcome:
         """Runs one batch there. Raises what the worker raised, or RuntimeError when it is gone."""
+        return self._ask(batch)
+
+    def _ask(self, message: Batch | Aim) -> Any:
         try:
-            self._send(batch)
+            self._send(message)
             answer = pickle.load(self._pipe_from())
         except (EOFError, OSError) as error:
             raise RuntimeError(f"a worker process ended: {error}") from error
@@ -174,7 +191,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     loaded: dict[int, Program | None] = {}
     while True:
         try:
-            message: Setup | Install | Batch = pickle.load(source)
+            message: Setup | Aim | Install | Batch = pickle.load(source)
         except EOFError:
             return
         try:
@@ -187,6 +204,9 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
                 received = [loaded[number] for number in message.numbers]
                 if all(received):  # else the runner compiles its own
                     runner.install(message.identity, [program for program in received if program])
+                runner.take_aimed(message.identity, message.aimed)
+            elif isinstance(message, Aim):
+                answer(runner.aimed(operator_of(runner.problem, message.transition)))
             else:
                 answer(runner.run(message))
         except Exception as error:  # noqa: BLE001 - sent to the process that asked

@@ -20,7 +20,7 @@ SCRIPTS = sorted((ROOT / "scripts").glob("*.py"))
 # no JAX, and the mathematics, which knows no graph; a thin bridge over both, and the porch.
 GRAPH = {"errors", "graph", "transitions", "uct"}
 MATHEMATICS = {
-    "poses", "distance", "augmented_lagrangian", "kinematics", "constraints", "collisions", "plans", "seeds", "costs",
+    "poses", "distance", "augmented_lagrangian", "kinematics", "constraints", "collisions", "plans", "seeds", "tables", "costs",
 }  # fmt: skip
 MAY_IMPORT = {
     # the search
@@ -37,6 +37,7 @@ MAY_IMPORT = {
     "collisions": {"constraints", "distance", "kinematics", "poses"},
     "plans": {"augmented_lagrangian", "collisions", "constraints", "distance", "kinematics", "poses"},
     "seeds": {"constraints", "plans", "poses"},
+    "tables": {"constraints", "kinematics", "plans", "poses", "seeds"},
     "costs": {"augmented_lagrangian", "plans", "poses"},
     # scenes, samples and what reads them
     "scene": {"errors"},
@@ -52,11 +53,12 @@ MAY_IMPORT = {
     "problems": {"errors", "graph", "transitions", "scene"} | MATHEMATICS,
     "operators": {"errors", "problems", "transitions"} | MATHEMATICS,
     "keyframes": {"constraints", "kinematics", "problems"},
-    "own": {"audit", "constraints", "errors", "graph", "problems"},
+    "own": {"audit", "constraints", "errors", "graph", "problems", "tables"},
     "batches": {
-        "audit", "augmented_lagrangian", "keyframes", "operators", "own", "problems", "programs", "scene", "transitions",
+        "audit", "augmented_lagrangian", "keyframes", "operators", "own", "problems", "programs", "scene", "tables",
+        "transitions",
     },
-    "worker": {"errors", "audit", "batches", "problems", "programs"},
+    "worker": {"errors", "audit", "batches", "operators", "problems", "programs", "transitions"},
     "sampler": {
         "errors", "audit", "augmented_lagrangian", "batches", "keyframes", "operators", "problems", "programs", "scene",
         "transitions", "uct", "worker",

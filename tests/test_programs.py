@@ -119,6 +119,7 @@ def test_a_worker_with_other_sources_refuses_in_one_line():
 
 def test_a_refusal_ends_the_run(monkeypatch):
     at = cgs_jax.load_problem("pick_place")
+    monkeypatch.setattr(worker, "_idle", [])
     monkeypatch.setattr(worker, "SOURCES", "another digest")
     with pytest.raises(InputError, match="other sources"):
         cgs_jax.sample(at, time_budget=30.0, method="expert3")
@@ -128,7 +129,7 @@ def test_a_worker_compiles_what_it_cannot_load():
     at, batch = grasps()
     setup = worker.Setup(*at.source, 0, SMALL, None)
     number = operator_of(at, batch.transition).identity
-    answers = told(programs.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}), batch)
+    answers = told(programs.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}, []), batch)
     assert answers[0] == "ready" and len(answers) == 2 and answers[1].success.all()
 
 
