@@ -115,7 +115,7 @@ class BatchRunner:
         self._seed = seed
         self._numbers: dict[Any, Any] = {}
         self._requested: dict[int, list[Future]] = {}
-        self._aimed: dict[int, AimedTables] = {}
+        self._aimed: dict[int, AimedTables] = self.problem.aimed
         self._lock = threading.Lock()
 
     # -------------------------------------------------------------- programs

@@ -322,7 +322,7 @@ def _check_constraints(problem: Problem, seed: int) -> tuple[list[ConstraintChec
         else declaration
         for name, declaration in problem.declarations.items()
     }
-    whole = dataclasses.replace(problem, declarations=kept, operators={})
+    whole = dataclasses.replace(problem, declarations=kept, operators={}, aimed={})
     measured = {c.name: _Measured(problem, whole, c.name, c.scope) for c in graph.constraints if c.name in kept}
     starts = dict(zip(graph.index, np.cumsum([0, *(v.dof for v in graph.variables)]), strict=False))
     ranks: dict[str, int] = dict.fromkeys(measured, 0)

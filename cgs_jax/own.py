@@ -99,7 +99,7 @@ def with_variable(
         tables={**problem.params.tables, table: SeedTable(np.zeros((dof, TABLE_SIZE), np.float32), {})},
     )
     table_of = {**problem.table_of, name: table}
-    return dataclasses.replace(problem, graph=graph, params=params, table_of=table_of, operators={}, source=None)
+    return dataclasses.replace(problem, graph=graph, params=params, table_of=table_of, operators={}, aimed={}, source=None)
 
 
 def with_sampler(
@@ -146,7 +146,7 @@ def with_sampler(
         # Values depend on what they were drawn from; the graph must know.
         _check_free(problem, sampler.link)
         problem = _linked(problem, Constraint(sampler.link, "Sampler", problem.graph.ordered(scope), 0, 0))
-    return dataclasses.replace(problem, samplers=(*problem.samplers, sampler), operators={}, source=None)
+    return dataclasses.replace(problem, samplers=(*problem.samplers, sampler), operators={}, aimed={}, source=None)
 
 
 def own_checks(problem: Problem) -> list[OwnCheck]:
@@ -208,7 +208,7 @@ def _check_free(problem: Problem, name: str) -> None:
 
 def _linked(problem: Problem, constraint: Constraint) -> Problem:
     graph = dataclasses.replace(problem.graph, constraints=(*problem.graph.constraints, constraint))
-    return dataclasses.replace(problem, graph=graph, operators={}, source=None)
+    return dataclasses.replace(problem, graph=graph, operators={}, aimed={}, source=None)
 
 
 def _limits(name: str, which: str, value: float | Sequence[float], dof: int) -> np.ndarray:

@@ -93,6 +93,8 @@ class Problem:
     """A user's direct samplers (`cgs_jax.with_sampler`)."""
     operators: dict = field(default_factory=dict, repr=False)
     """Operators by conditional problem, made on demand (`cgs_jax.operators.operator_of`)."""
+    aimed: dict = field(default_factory=dict, repr=False)
+    """Seed tables by operator's identity, made on demand (`cgs_jax.operators.aimed_at`) and kept from run to run."""
 
     @functools.cached_property
     def transitions(self) -> Transitions:
@@ -135,7 +137,7 @@ def with_collisions(problem: Problem, collisions: Collisions) -> Problem:
         raise InputError(f"collisions are seen to '{collisions}', expected one of: after, inside")
     if collisions == problem.collisions:
         return problem
-    return dataclasses.replace(problem, collisions=collisions, operators={})
+    return dataclasses.replace(problem, collisions=collisions, operators={}, aimed={})
 
 
 class _Builder:

@@ -574,7 +574,8 @@ class Sampler:
             most = self._affordable(step.operator)
             if visits < LOOKS:
                 most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
-            enough = max(most // 2, 1)
+            # A first look takes what there is: while it waits for more, the search may turn to something else for good.
+            enough = max(most // (2 if visits else 8), 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
                 count = most

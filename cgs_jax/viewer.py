@@ -46,7 +46,7 @@ def _import_viser() -> Any:
     try:
         import viser
     except ImportError:
-        raise InputError("the viewer needs viser, install the extra: pip install 'cgs_jax[viewer]'") from None
+        raise InputError('--view needs the package viser, install it with: pip install -e ".[viewer]"') from None
     return viser
 
 
