@@ -6,6 +6,7 @@ import pickle
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -41,6 +42,16 @@ UNTRIED = {
     "… failed with status …: …": "a measurement",
     "… ended with status …: …": "a measurement",
     "… holds runs of another budget or other settings, choose another folder": "in test_reproduce.py",
+    "MUJOCO_GL=… switches pictures off; unset it, or set it to egl or osmesa": "in test_render.py",
+    "…: floating robot '…' hangs at switch '…'; expected a configuration of it there": "needs a second robot, in no scene",
+    "OpenGL by … does not work here: …": "a machine without libraries",
+    "OpenGL by … cannot draw: …": "a machine without memory",
+    "port … does not exist, expected 1 to 65535": "in test_viewer.py, where viser is installed",
+    "cannot serve on …: …": "in test_viewer.py, where viser is installed",
+    "no free port on … from … to …": "a machine with a hundred ports in use",
+    "no body '…' in the sample set's MJCF": "in test_viewer.py, where viser is installed",
+    "MuJoCo's own viewer needs a display and DISPLAY is not set; --view works without one": "in test_viewer.py",
+    "MuJoCo's own viewer …; --view works without …": "in test_viewer.py",
 }
 
 
@@ -150,6 +161,14 @@ def calls(folder):
     yield lambda: SampleSet.load(folder / "other.npz")
     yield lambda: render.switch_index(samples, "place")
     yield lambda: render.check_indices(samples, [3])
+    yield lambda: render.check_indices(samples, [])
+    for camera in ("above", "90,-91", "90,-25,0"):
+        yield lambda camera=camera: render.Camera.parse(camera)
+    yield lambda: render.contact_sheet(samples, [0], size=(1, 1))
+    yield lambda: render.contact_sheet(samples, [0] * 1000, size=(4000, 4000))
+    yield lambda: render.animation(samples, [0], hold=0.0)
+    yield lambda: render.compile_model(replace(samples, mjcf="<mujoco"))
+    yield lambda: render.compile_model(samples)
     show = load_script("show")
     yield lambda: show.choose(samples, "some")
     yield lambda: show.parse_size("big")
