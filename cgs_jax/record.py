@@ -311,6 +311,7 @@ def sample_set(problem: Problem, found: list[Found], meta: Mapping[str, Any], co
         attachments=attachments(task),
         placements=placements(task),
         goals=goals(task),
+        configurations=problem.scene.configurations(),
         sequences=texts,
         sequence=np.repeat([texts.index(e.sequence) for e in found], [len(e.qpos) for e in found]).astype(np.intp),
         elapsed=np.repeat([e.elapsed for e in found], [len(e.qpos) for e in found]),

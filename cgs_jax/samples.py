@@ -34,6 +34,9 @@ _KEYS = (
     " meta"
 ).split()
 
+_LISTS = ("attachments", "placements", "goals", "configurations")
+"""Keys whose values are JSON lists."""
+
 
 @dataclass(frozen=True, eq=False)
 class SampleSet:
@@ -44,6 +47,7 @@ class SampleSet:
     mode_switches: K names in time order.
     qpos: (N, K, nq) full MuJoCo configurations.
     attachments, placements, goals: what must hold, as lists of plain dicts (schema `cgs_jax/1`).
+    configurations: which joints each variable sets and where the others rest, by mode switch (`Scene.configurations`).
     sequences, sequence: texts, and for each sample the index (N,) of the one that made it.
     elapsed: (N,) seconds of sampling time when the sample passed the audit.
     violation, constraints: (N, C) largest violation of each of C named constraints, m or rad.
@@ -68,6 +72,7 @@ class SampleSet:
     constraints: tuple[str, ...] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
     kinds: Mapping[str, str] = field(default_factory=dict)
+    configurations: Sequence[Mapping[str, Any]] = ()
 
     def __post_init__(self) -> None:
         def keep(name: str, value: object) -> None:
@@ -135,7 +140,7 @@ class SampleSet:
             raise InputError("no sample set to concatenate, expected at least one")
         first = parts[0]
         for part in parts[1:]:
-            for name in ("mjcf", "mode_switches", "constraints", "attachments", "placements", "goals"):
+            for name in ("mjcf", "mode_switches", "constraints", *_LISTS):
                 ours, theirs = getattr(first, name), getattr(part, name)
                 if ours != theirs and list(ours) != list(theirs):
                     raise InputError(f"sample sets differ in {name}, expected sets of one instance")
@@ -222,7 +227,7 @@ class SampleSet:
             "constraints": _texts(self.constraints),
             "meta": np.array(json.dumps(self.meta, default=_plain)),
         }
-        for name in ("attachments", "placements", "goals"):
+        for name in _LISTS:
             arrays[name] = np.array(json.dumps([dict(entry) for entry in getattr(self, name)], default=_plain))
         arrays.update({f"x_{name}": value for name, value in self.variables.items()})
         temporary = None
@@ -273,7 +278,9 @@ class SampleSet:
         if missing:
             raise InputError(f"{source} lacks {', '.join(missing)}, expected every key of schema {SCHEMA}")
         try:
-            declared = {name: json.loads(str(stored[name])) for name in ("attachments", "placements", "goals", "meta")}
+            # Files of earlier versions have no configurations.
+            stored.setdefault("configurations", np.array("[]"))
+            declared = {name: json.loads(str(stored[name])) for name in (*_LISTS, "meta")}
             kinds = [str(kind) for kind in stored.get("kinds", ())]
             return cls(
                 mjcf=str(stored["mjcf"]),

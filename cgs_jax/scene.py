@@ -803,6 +803,27 @@ class Scene:
         mujoco.mju_mat2Quat(quat, self._home.site_xmat[index])
         return np.concatenate([self._home.site_xpos[index], quat])
 
+    def configurations(self) -> list[dict[str, Any]]:
+        """Where the joints stand at each mode switch, JSON-ready (schema cgs_jax/1).
+
+        Entries are {"at": switch, "joints": names} with "variable" for a robot that acts, and with "values" (rad or m) for all
+        hinges and slides that stay at home.
+        """
+        hinges_and_slides = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+        named = [joint for joint in map(self.model.joint, range(self.model.njnt)) if joint.name]
+        home = {j.name: float(self.home_qpos[j.qposadr[0]]) for j in named if j.type[0] in hinges_and_slides}
+        entries: list[dict[str, Any]] = []
+        for switch in self.task.switches:
+            resting = dict(home)
+            for robot, variable in switch.configurations.items():
+                joints = list(self.task.robot(robot).joints)
+                entries.append({"at": switch.name, "joints": joints, "variable": variable})
+                for joint in joints:
+                    del resting[joint]
+            if resting:
+                entries.append({"at": switch.name, "joints": list(resting), "values": list(resting.values())})
+        return entries
+
     def collision_pairs(self) -> list[tuple[int, int]]:
         """Pairs of geom ids that MuJoCo would test for contact, by its own filter, each pair once and in order.
 

@@ -30,6 +30,9 @@ PENETRATION = 1e-4
 LIMIT = 1e-6
 QUATERNION = 1e-6
 
+# Keys that a file may have beside these.
+FURTHER = "configurations"
+
 # Columns of `violation` that begin so are of constraints and variables that the maker of the file added as code.
 OWN = "own: "
 
@@ -46,6 +49,7 @@ ALLOWED = {
     "goal rotation (rad)": RADIANS,
     "penetration (m)": PENETRATION,
     "joint limits (rad or m)": LIMIT,
+    "configurations (rad or m)": LIMIT,
     "unit quaternions": QUATERNION,
 }
 
@@ -81,7 +85,8 @@ def read(path: str) -> dict:
         if data[key].ndim != 1:
             raise BadInput(f"{key} has shape {data[key].shape}, expected one row of names")
         data[key] = [str(name) for name in data[key]]
-    for key in ("attachments", "placements", "goals", "meta"):
+    data.setdefault(FURTHER, np.array("[]"))
+    for key in ("attachments", "placements", "goals", FURTHER, "meta"):
         try:
             data[key] = json.loads(str(data[key]))
         except json.JSONDecodeError as error:
@@ -309,6 +314,8 @@ class Verification:
         self.poses[None], _ = self.scene.evaluate(self.scene.model.qpos0[None], wanted)
         self.note("penetration (m)", penetration)
         self.check_joints()
+        for entry in self.data[FURTHER]:
+            self.check_configuration(entry)
         for entry in self.data["attachments"]:
             self.check_attachment(entry)
         for entry in self.data["placements"]:
@@ -336,6 +343,12 @@ class Verification:
                     (grasp["rows"], grasp["low"], grasp["high"])
                 elif grasp:
                     raise BadInput(f"unknown grasp kind {grasp['kind']!r}, expected touch or two_finger")
+            for entry in self.data[FURTHER]:
+                self.switch(entry["at"])
+                for joint in entry["joints"]:
+                    self.scene.find(joint, "joint")
+                if "variable" not in entry:
+                    entry["values"]
             for entry in self.data["placements"]:
                 self.switch(entry["at"])
                 (entry["low"], entry["high"])
@@ -345,7 +358,8 @@ class Verification:
                 (entry["position"], entry["rotation"])
                 wanted |= {self.scene.find(entry["object"], "body site"), self.scene.find(entry["site"], "site")}
         except (KeyError, TypeError) as error:
-            raise BadInput(f"an attachment, placement or goal is incomplete: {type(error).__name__} {error}") from None
+            what = "an attachment, placement, goal or configuration"
+            raise BadInput(f"{what} is incomplete: {type(error).__name__} {error}") from None
         return sorted(wanted)
 
     def at(self, switch: str | None, name: str, kinds: str) -> tuple:
@@ -369,6 +383,24 @@ class Verification:
                 beyond = np.maximum(beyond, np.maximum(low - value, value - high).max(axis=1))
         self.note("joint limits (rad or m)", beyond)
         self.note("unit quaternions", deviation)
+
+    def check_configuration(self, entry: dict) -> None:
+        """The joints stand where the stored variable says, or where they rest."""
+        joints = [self.scene.find(joint, "joint")[1] for joint in entry["joints"]]
+        shown = self.qpos[:, self.switches.index(entry["at"]), self.scene.model.jnt_qposadr[joints]]
+        if "variable" in entry:
+            variable, names = entry["variable"], self.data["variables"]
+            if variable not in names or self.data[f"x_{variable}"].shape[1] != len(joints):
+                raise BadInput(
+                    f"a configuration names the variable {variable!r}, expected one of {len(joints)} columns among "
+                    f"{', '.join(names)}"
+                )
+            stored = self.data[f"x_{variable}"][: self.count].astype(float)
+        else:
+            stored = np.array(entry["values"], dtype=float)
+            if stored.shape != (len(joints),):
+                raise BadInput(f"a configuration has values of shape {stored.shape}, expected {(len(joints),)}")
+        self.note("configurations (rad or m)", np.where(self.finite, np.abs(shown - stored).max(axis=1, initial=0.0), 0.0))
 
     def check_stored(self, check: str, variable: str | None, pose: tuple) -> None:
         """Where an entry names its variable, the stored pose is what `qpos` shows."""

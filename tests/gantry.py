@@ -42,6 +42,8 @@ TWO_FINGER = {
 }
 REGION = {"low": [0.2, -0.6, 0.1], "high": [0.6, 0.6, 0.1]}
 PLACEMENT = {"object": "box", "at": "place", **REGION, "quat": None, "upright": True}
+JOINTS = ["x", "y", "z", "yaw", "tilt"]
+CONFIGURATIONS = [{"at": "pick", "joints": JOINTS, "variable": "q_1"}, {"at": "place", "joints": JOINTS, "variable": "q_2"}]
 GOAL = {"object": "box", "site": "goal", "at": "place", "position": True, "rotation": True}
 
 
@@ -121,6 +123,7 @@ def sample_set(qpos, t, grasp=TOUCH, placements=(PLACEMENT,), goals=()):
         constraints=("Kin(t,q_1)",),
         meta={"scene": "gantry", "seed": 0},
         kinds={"q_1": "configuration", "q_2": "configuration", "t": "pose"},
+        configurations=CONFIGURATIONS,
     )
 
 

@@ -26,7 +26,8 @@ def test_file_has_the_schema_and_comes_back(tmp_path):
         assert archive["x_t"].shape == (6, 7)
         assert all(archive[key].shape == () for key in ("schema", "mjcf", "attachments", "placements", "goals", "meta"))
     back = SampleSet.load(path.parent)
-    for name in ("mjcf", "mode_switches", "attachments", "placements", "sequences", "constraints", "meta", "kinds"):
+    lists = ("attachments", "placements", "goals", "configurations")
+    for name in ("mjcf", "mode_switches", *lists, "sequences", "constraints", "meta", "kinds"):
         assert getattr(back, name) == getattr(samples, name), name
     for name in ("qpos", "sequence", "elapsed", "violation"):
         np.testing.assert_array_equal(getattr(back, name), getattr(samples, name))

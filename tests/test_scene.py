@@ -335,6 +335,23 @@ def test_attachments_of_banana_say_where_each_body_rests():
     )
 
 
+def test_configurations_name_every_joint_of_every_switch_once(loaded):
+    """The other arm stands at home, which the MJCF's keyframe has as text."""
+    scene = loaded["handover", 2]
+    entries = scene.configurations()
+    a, b = ([f"{prefix}_joint{i}" for i in range(1, 8)] for prefix in "ab")
+    qpos = scene.model.key("home").qpos
+    home = {name: qpos[scene.model.joint(name).qposadr[0]] for name in (*a, *b)}
+    assert entries == [
+        {"at": "pick", "joints": a, "variable": "q_a1"},
+        {"at": "pick", "joints": b, "values": [home[name] for name in b]},
+        {"at": "handover", "joints": a, "variable": "q_a2"},
+        {"at": "handover", "joints": b, "variable": "q_b2"},
+        {"at": "place", "joints": b, "variable": "q_b1"},
+        {"at": "place", "joints": a, "values": [home[name] for name in a]},
+    ]
+
+
 def test_attachments_of_handover_follow_the_hands():
     entries = scenes.attachments(scenes.load_task("handover"))
     where = [(e["object"], e["frame"], e["from"], e["to"]) for e in entries]

@@ -86,6 +86,24 @@ def test_no_samples_is_no_failure(verify, tmp_path, capsys):
     assert "no samples in this file" in capsys.readouterr().out
 
 
+def test_values_of_configurations_and_resting_joints_are_those_of_qpos(verify, tmp_path, capsys):
+    qpos, t, _ = gantry.valid(3)
+    wrong = qpos[:, 1, :5].copy()
+    wrong[1, 3] += 2e-6
+    resting = {"at": "place", "joints": ["tilt"], "values": [2e-6]}
+    rested = {**resting, "values": [0.0]}
+    for changed, bad in (
+        ({"x_q_2": wrong}, [1]),
+        ({"configurations": np.array(json.dumps([resting]))}, [0, 1, 2]),
+        ({"configurations": np.array(json.dumps([*gantry.CONFIGURATIONS, rested]))}, []),
+        ({"configurations": None}, []),
+    ):
+        assert verify.main([str(write(tmp_path, qpos, t, **changed)), "--json"]) == bool(bad)
+        report = json.loads(capsys.readouterr().out)
+        assert report["first_bad"] == bad
+        assert report["checks"].get("configurations (rad or m)", {"bad": 0})["bad"] == len(bad)
+
+
 def test_goals_count_in_what_they_demand(verify, tmp_path):
     pick = [*gantry.START[:2], 0.2, 0.0, 0.0]
     at_goal, t = gantry.sample(pick, [0.6, 0.2, 0.2, 0.0, 0.0])
@@ -118,6 +136,11 @@ def test_goals_count_in_what_they_demand(verify, tmp_path):
         ({"goals": np.array('[{"object": "box"}]')}, "incomplete"),
         ({"goals": np.array(json.dumps([{**gantry.GOAL, "site": "star"}]))}, "mjcf has no site named 'star'"),
         ({"goals": np.array(json.dumps([{**gantry.GOAL, "at": "later"}]))}, "unknown mode switch 'later'"),
+        ({"configurations": np.array('[{"at": "pick"}]')}, "incomplete"),
+        ({"configurations": np.array('[{"at": "pick", "joints": ["x"]}]')}, "incomplete"),
+        ({"configurations": np.array('[{"at": "pick", "joints": ["w"], "values": [0]}]')}, "mjcf has no joint named 'w'"),
+        ({"configurations": np.array('[{"at": "pick", "joints": ["x"], "values": [0, 0]}]')}, "expected (1,)"),
+        ({"configurations": np.array('[{"at": "pick", "joints": ["x"], "variable": "q_1"}]')}, "1 columns among q_1, q_2"),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(changed, message, verify, tmp_path, capsys):
