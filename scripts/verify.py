@@ -300,6 +300,7 @@ class Verification:
     def run(self) -> None:
         self.qpos = self.data["qpos"][: self.count]
         finite = np.isfinite(self.qpos).all(axis=(1, 2)) & np.isfinite(self.data["elapsed"][: self.count])
+        finite &= np.isfinite(self.data["violation"][: self.count]).all(axis=1)
         for name in self.data["variables"]:
             finite &= np.isfinite(self.data[f"x_{name}"][: self.count]).all(axis=1)
         self.note("finite numbers", (~finite).astype(float))

@@ -104,6 +104,13 @@ def test_values_of_configurations_and_resting_joints_are_those_of_qpos(verify, t
         assert report["checks"].get("configurations (rad or m)", {"bad": 0})["bad"] == len(bad)
 
 
+def test_a_violation_that_is_no_number_is_caught(verify, tmp_path, capsys):
+    qpos, t, _ = gantry.valid(3)
+    assert verify.main([str(write(tmp_path, qpos, t, violation=np.array([[0.0], [np.nan], [0.0]]))), "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["first_bad"] == [1] and report["checks"]["finite numbers"]["bad"] == 1
+
+
 def test_goals_count_in_what_they_demand(verify, tmp_path):
     pick = [*gantry.START[:2], 0.2, 0.0, 0.0]
     at_goal, t = gantry.sample(pick, [0.6, 0.2, 0.2, 0.0, 0.0])
