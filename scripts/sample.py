@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 TREES = ("tree", "tree-warm")
 WRITTEN = ("samples.npz", "tree.json", "run.json", "profile.json", "samples_sheet.png", "samples.gif", "report.html")
 
+MOST_TASKS = 2**20
+"""Tasks of one batch at most: more would only fill the memory."""
+
 APPEND_SECONDS = 1.0
 """Sampling time from one part on disk to the next: what a killed run loses at most."""
 
@@ -152,6 +155,8 @@ def check_numbers(options: argparse.Namespace) -> None:
             raise InputError(f"--batch-size is '{options.batch_size}', expected a whole number or auto") from None
         if options.batch_size < 1:
             raise InputError(f"--batch-size is {options.batch_size}, expected at least 1")
+        if options.batch_size > MOST_TASKS:
+            raise InputError(f"--batch-size is {options.batch_size}, expected at most {MOST_TASKS}")
     if options.check:
         for name in ("profile", "report", "render", "view", "diverse", "save_tree"):
             if getattr(options, name):

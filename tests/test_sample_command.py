@@ -327,6 +327,7 @@ def refused(capsys, out, *arguments):
         ("--scene pick_place --time-budget nan", "--time-budget is nan"),
         ("--scene pick_place --batch-size 0", "--batch-size is 0, expected at least 1"),
         ("--scene pick_place --batch-size -5", "--batch-size is -5"),
+        ("--scene pick_place --batch-size 99999999999", "--batch-size is 99999999999, expected at most 1048576"),
         ("--scene pick_place --batch-size many", "--batch-size is 'many', expected a whole number or auto"),
         ("--scene pick_place --num-samples 0", "--num-samples is 0, expected at least 1"),
         ("--scene pick_place --coverage-gain 0", "--coverage-gain is 0, expected a share between 0 and 1"),
