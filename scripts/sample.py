@@ -207,6 +207,9 @@ def writable(*folders: Path) -> Iterator[None]:
                     made.append(path)
                 with tempfile.TemporaryFile(dir=folder):
                     pass
+                for path in (folder / name for name in WRITTEN):
+                    if path.is_dir():
+                        raise InputError(f"cannot write to {path}: it is a folder, expected a file or nothing")
             except OSError as error:
                 raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
         yield

@@ -395,6 +395,10 @@ def test_an_output_that_cannot_be_written_is_found_before_sampling(capsys, tmp_p
     # Folders that were made for one output go again when the other cannot be written.
     message = refused(capsys, tmp_path / "a" / "b", "--scene", "pick_place", "--save-tree", blocked / "tree.json")
     assert f"cannot write to {blocked}" in message and not (tmp_path / "a").exists()
+    (tmp_path / "taken" / "samples.npz").mkdir(parents=True)
+    assert command.main(["--scene", "pick_place", "--out", str(tmp_path / "taken")]) == 2
+    message = capsys.readouterr().err
+    assert len(message.splitlines()) == 1 and f"cannot write to {tmp_path / 'taken' / 'samples.npz'}: it is a folder" in message
     assert f"cannot write to {tmp_path}" in refused(capsys, tmp_path / "out", "--scene", "pick_place", "--save-tree", tmp_path)
 
 
