@@ -274,35 +274,61 @@ class LiveLine:
 # ------------------------------------------------------------------ running
 
 
+INTERRUPTED = "sample.py: interrupted before the samples were written"
+
+
+@contextlib.contextmanager
+def on_interrupt(handler: Any) -> Iterator[None]:
+    """Ctrl-C is answered by this handler within the block."""
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def leave(*_: object) -> NoReturn:
+    """Ends the process at once: an exception would be lost inside a library that is being imported, or crash it."""
+    restored = b"\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else b""
+    os.write(sys.stderr.fileno(), restored + INTERRUPTED.encode() + b"\n")
+    os._exit(3)
+
+
 def run(options: argparse.Namespace) -> int:
     """Checks, samples, writes, reports; returns the exit status. Raises InputError for bad input."""
     check_numbers(options)
-    task = check_scene(options)
-    check_viewers(options)
+    with on_interrupt(leave):
+        task = check_scene(options)
+        check_viewers(options)
     folder = options.out if options.out is not None else Path("runs") / f"{task.name}-{options.instance}"
     if options.check:
         return check(options, folder)
     with LiveLine(not options.quiet) as line:
-        if not options.no_cache:
-            cgs_jax.enable_disk_cache()
-        problem = cgs_jax.load_problem(options.scene, options.instance)
-        prior = [cgs_jax.load_tree(path) for path in options.warm_start]
-        settings = cgs_jax.SamplerSettings(
-            pools=not options.no_pools,
-            deterministic=options.deterministic,
-            collisions=options.collisions,
-            **{name: getattr(options, name) for name in ("batch_size", "tries") if getattr(options, name) is not None},
-        )
-        sampling = cgs_jax.Run(
-            problem, options.method, options.seed, settings, prior, c_uct=options.c_uct, reward=options.reward
-        )
+        with on_interrupt(leave):
+            if not options.no_cache:
+                cgs_jax.enable_disk_cache()
+            problem = cgs_jax.load_problem(options.scene, options.instance)
+            prior = [cgs_jax.load_tree(path) for path in options.warm_start]
+            settings = cgs_jax.SamplerSettings(
+                pools=not options.no_pools,
+                deterministic=options.deterministic,
+                collisions=options.collisions,
+                **{name: getattr(options, name) for name in ("batch_size", "tries") if getattr(options, name) is not None},
+            )
+            sampling = cgs_jax.Run(
+                problem, options.method, options.seed, settings, prior, c_uct=options.c_uct, reward=options.reward
+            )
         folders = [folder] + ([options.save_tree.parent] if options.save_tree else [])
         if options.save_tree and options.save_tree.is_dir():
             raise InputError(f"cannot write to {options.save_tree}: it is a folder, expected the name of a file")
         with writable(*folders):
             drive(sampling, options, line, folder)
             line.enter_phase("writing")
-            samples = write(sampling.record, options, folder)
+            with on_interrupt(signal.SIG_IGN):
+                samples = write(sampling.record, options, folder)
+            # Ctrl-C does without what is still to be drawn.
+            with contextlib.suppress(KeyboardInterrupt):
+                draw(samples, options, folder)
     return tell(sampling.record, samples, options, folder)
 
 
@@ -311,7 +337,8 @@ def check(options: argparse.Namespace, folder: Path) -> int:
     from cgs_jax import diagram
 
     with LiveLine(not options.quiet) as line, writable(folder):
-        problem = cgs_jax.load_problem(options.scene, options.instance)
+        with on_interrupt(leave):
+            problem = cgs_jax.load_problem(options.scene, options.instance)
         line.enter_phase("checking")
         prior = [cgs_jax.load_tree(path) for path in options.warm_start]
         found = cgs_jax.check_problem(problem, options.seed)
@@ -381,6 +408,11 @@ def write(record: Recorder, options: argparse.Namespace, folder: Path) -> Sample
             record.save_profile(folder / "profile.json")
     except OSError as error:
         raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
+    return samples
+
+
+def draw(samples: SampleSet, options: argparse.Namespace, folder: Path) -> None:
+    """Draws the pictures and the report that were asked for, from what is written."""
     if options.render and len(samples):
         from cgs_jax import render
 
@@ -389,7 +421,6 @@ def write(record: Recorder, options: argparse.Namespace, folder: Path) -> Sample
         from cgs_jax import report
 
         report.save_report(folder)
-    return samples
 
 
 # ------------------------------------------------------------------ the closing words
@@ -555,7 +586,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"sample.py: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("sample.py: interrupted before the first sample", file=sys.stderr)
+        print(INTERRUPTED, file=sys.stderr)
         return 3
 
 

@@ -278,6 +278,47 @@ def test_ctrl_c_before_the_first_sample_ends_with_status_3(tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["run.json", "tree.json"]
 
 
+@pytest.mark.parametrize("library", ["numpy", "mujoco", "jax"])
+def test_ctrl_c_while_a_library_is_imported_ends_with_status_3(library, tmp_path):
+    """An exception in there would be a traceback of the library's, or be swallowed."""
+    code = (
+        "import builtins, runpy, signal, sys\n"
+        f"sys.argv = [{str(SCRIPT)!r}, '--scene', 'pick_place', '--num-samples', '1', '--out', {str(tmp_path / 'out')!r}]\n"
+        "plain = builtins.__import__\n"
+        "def interrupted(name, *rest):\n"
+        f"    if name == {library!r}:\n"
+        "        try: signal.raise_signal(signal.SIGINT)\n"
+        "        except KeyboardInterrupt: pass\n"
+        "    return plain(name, *rest)\n"
+        "builtins.__import__ = interrupted\n"
+        f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr.splitlines() == ["sample.py: interrupted before the samples were written"]
+    assert not (tmp_path / "out").exists()
+
+
+def test_ctrl_c_while_writing_or_drawing_keeps_the_samples(tmp_path, monkeypatch, capsys):
+    """The budget is over: what was found is written whole, and the drawing is done without."""
+    save = SampleSet.save
+
+    def interrupted(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    def slow(self, path):
+        interrupted()
+        return save(self, path)
+
+    monkeypatch.setattr(SampleSet, "save", slow)
+    monkeypatch.setattr(render, "save_pictures", interrupted)
+    monkeypatch.setattr(render, "backend", lambda: None)
+    options = ["--num-samples", "5", "--time-budget", "60", "--render", "--quiet"]
+    assert command.main(["--scene", "pick_place", "--out", str(tmp_path), *options]) == 0
+    assert len(verified(tmp_path)) == 5 and capsys.readouterr().err == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.json", "samples.npz", "tree.json"]
+
+
 def goal_in_the_wall(text):
     return text + (
         '\n[[instances]]\ntitle = "goal inside the wall"\n'
