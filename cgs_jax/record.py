@@ -99,6 +99,7 @@ class Recorder:
         self.reason: str | None = None
         self._found: list[Found] = []
         self._appended = self._parts = 0
+        self._final: dict[str, Any] | None = None
 
     def listen(self, event: Event) -> None:
         """Takes one event in."""
@@ -117,6 +118,8 @@ class Recorder:
             self.elapsed = event.elapsed
         elif isinstance(event, Finished):
             self.reason, self.elapsed = event.reason, event.elapsed
+            # Asking the chooser for its best sequences moves its price: all files of a run tell one.
+            self._final = self.meta()
 
     def _ran(self, event: Ran) -> None:
         record = self.operators.setdefault(operator_text(event.path[event.position]), OperatorRecord())
@@ -156,7 +159,9 @@ class Recorder:
         return sample_set(self.problem, self._found if found is None else found, self.meta(), self._columns)
 
     def meta(self) -> dict[str, Any]:
-        """Description of the run, JSON-ready (`meta` of schema cgs_jax/1)."""
+        """Description of the run, JSON-ready (`meta` of schema cgs_jax/1); the same from the end of the run on."""
+        if self._final is not None:
+            return dict(self._final)
         chooser: Any = self.chooser
         price = getattr(chooser, "price", chooser.rate)
         transitions = self.problem.transitions

@@ -94,6 +94,9 @@ def test_the_files_beside_tell_the_run(finished):
     assert (told["transitions"]["complete"], told["transitions"]["pruned"]) == counts[scene]
     assert told["samples"] == 20 and told["rate"] > 0 and told["startup_seconds"] > 0
     assert told["diagnosis"] is None and told["best_sequences"]
+    meta = SampleSet.load(out).meta
+    assert {key: told[key] for key in meta} == meta
+    assert 0 < meta["lambda"] < 1 and meta["ended_by"] == "samples"
     assert all(0 <= share <= 1 for shares in told["spread"].values() for share in shares.values())
     assert json.loads((out / "tree.json").read_text())["schema"] == "cgs_jax.tree/2"
     assert sorted(path.name for path in out.iterdir()) == ["run.json", "samples.npz", "tree.json"]
