@@ -80,6 +80,9 @@ class OperatorRecord:
 class Recorder:
     """Aggregates the events of one run."""
 
+    reason: str | None = None
+    """What ended the run; None while it is under way."""
+
     def __init__(
         self,
         problem: Problem,
@@ -96,7 +99,6 @@ class Recorder:
         self.host_seconds = self.audit_seconds = self.elapsed = 0.0
         self.programs: list[tuple[str, float]] = []
         self.count = self.rejected = 0
-        self.reason: str | None = None
         self._found: list[Found] = []
         self._appended = self._parts = 0
         self._final: dict[str, Any] | None = None
@@ -216,6 +218,8 @@ class Recorder:
     def diagnosis(self) -> str:
         """Which operator and constraint stopped the run, in one line; for runs without a sample."""
         tried = [(name, record) for name, record in self.operators.items() if record.tasks]
+        if not tried and self.reason == "interrupt":
+            return "the run was interrupted before an operator had run"
         if not tried:
             return "no operator ran before the budget ended; give more time with --time-budget"
         name, record = min(tried, key=lambda item: (item[1].success_rate, -item[1].tasks))

@@ -281,6 +281,17 @@ def test_ctrl_c_before_the_first_sample_ends_with_status_3(tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["run.json", "tree.json"]
 
 
+def test_ctrl_c_while_compiling_says_so(tmp_path):
+    out = tmp_path / "out"
+    with on_a_terminal("--scene", "pick_place", "--no-cache", "--out", out) as (process, terminal):
+        until(terminal, r"compiling", 60)
+        process.send_signal(signal.SIGINT)
+        shown = until(terminal, r"no sample: the run was interrupted before an operator had run", 60)
+        process.communicate(timeout=20)
+    assert process.returncode == 3 and "Traceback" not in shown
+    assert json.loads((out / "run.json").read_text())["ended_by"] == "interrupt"
+
+
 @pytest.mark.parametrize("library", ["numpy", "mujoco", "jax"])
 def test_ctrl_c_while_a_library_is_imported_ends_with_status_3(library, tmp_path):
     """An exception in there would be a traceback of the library's, or be swallowed."""
