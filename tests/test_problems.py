@@ -1,5 +1,6 @@
 """A user's own constraints: satisfied by the samples, and checked when they are made."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -63,6 +64,18 @@ def test_wrong_constraints_are_refused_in_one_line(case):
     with pytest.raises(InputError, match=message.replace("(q1)", r"\(q1\)")) as caught:
         cgs_jax.with_constraint(problem("pick_place"), **(FINE | change))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["pick_place", "handover", "banana"])
+def test_instances_differ_in_numbers_only(name):
+    """Same structure, shapes and types, and hence no new trace."""
+
+    def shapes(instance):
+        return jax.tree.map(lambda a: (a.shape, a.dtype), problem(name, instance).params)
+
+    for instance in range(1, 8):
+        assert shapes(instance) == shapes(0), instance
+        assert problem(name, instance).graph == problem(name, 0).graph
 
 
 def test_every_problem_of_the_scenes_has_the_papers_counts():
