@@ -216,7 +216,7 @@ def operator(
     values: `(lanes, dim)` of the given variables that the operator reads; `lanes` is needed only where it reads none.
     params: `problem.params`, or other numbers of the same shapes. Returns `(lanes, dim)` per new variable and a mask: rows
     within the solver's tolerance and clearance within `PENETRATION`. Composes with `jax.jit`, `jax.vmap` (over params or
-    keys) and `shard_map`. Raises InputError for unknown variables, or when given and new overlap.
+    keys) and `jax.shard_map` (with `check_vma=False`). Raises InputError for unknown variables, or when given and new overlap.
 
     cost: a smooth JAX function of some new (and given) variables, its parameters called like them, one lane at a time:
     configurations `(dof,)` in rad or m, poses `(7,)` `[x y z qw qx qy qz]`; returns a number. Every lane then goes on from its

@@ -67,6 +67,21 @@ def test_operators_compose_with_vmap_over_scenes(grasp, reach):
         assert (np.asarray(feasible[i]) == np.asarray(expected)).mean() > 0.9
 
 
+def test_operators_compose_with_shard_map(grasp, reach):
+    at = problem("pick_place")
+    apply = cgs_jax.operator(at, given=("t",), new=("q1",))
+    mesh = jax.make_mesh((len(jax.devices()),), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
+    split, whole = jax.sharding.PartitionSpec("lanes"), jax.sharding.PartitionSpec()
+    run = jax.shard_map(
+        lambda key, t, params: apply(key, {"t": t}, params),
+        mesh=mesh, in_specs=(whole, split, whole), out_specs=split, check_vma=False,
+    )  # fmt: skip
+    found, feasible = jax.jit(run)(jax.random.key(1), grasp, at.params)
+    _, expected = reach(jax.random.key(1), grasp, at.params)
+    assert found["q1"].shape == (LANES, 7)
+    assert (np.asarray(feasible) == np.asarray(expected)).mean() > 0.9
+
+
 def solve(at, tasks, lanes, first, count, seed=0):
     operator = operator_of(at, conditional(at, (), ("q1", "t")))
     given = jnp.asarray(gather_given(operator, at.params, {}, tasks))
