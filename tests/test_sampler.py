@@ -81,6 +81,13 @@ def test_the_same_seed_repeats_the_run_and_another_does_not(fixed):
     assert np.abs(first[:5] - third[:5]).max() > 1e-3
 
 
+def test_the_streams_do_not_depend_on_the_batch_size():
+    small, large = (of(Found, run(tries=1, batch_size=size)) for size in (128, 64))
+    for name in ("t", "q1", "q2"):
+        first, second = (np.concatenate([event.values[name] for event in events]) for events in (small, large))
+        np.testing.assert_allclose(first, second, atol=1e-6)
+
+
 def test_a_condition_is_tried_as_often_as_the_settings_say():
     once = of(Ran, run(tries=1))
     assert sum(event.second_tries for event in once) == 0
