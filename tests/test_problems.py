@@ -78,6 +78,24 @@ def test_instances_differ_in_numbers_only(name):
         assert problem(name, instance).graph == problem(name, 0).graph
 
 
+def test_two_instances_are_clearly_harder_for_a_joint_solve():
+    """At most a fifth of instance 0's success where all variables are solved at once."""
+    settings = SamplerSettings(batch_size=256, lanes=32, tries=1, workers=1, deterministic=True)
+
+    def success(instance):
+        tasks = cleared = 0
+        for event in cgs_jax.Run(problem("pick_place", instance), "expert1", settings=settings).events(60.0):
+            if type(event).__name__ == "Ran":
+                tasks, cleared = tasks + event.tasks, cleared + event.cleared
+                if tasks >= 1024:
+                    break
+        return cleared / tasks
+
+    roomy = success(0)
+    assert roomy > 0.05
+    assert max(success(6), success(7)) <= roomy / 5
+
+
 def test_every_problem_of_the_scenes_has_the_papers_counts():
     for name, kept, distinct in (("pick_place", 8, 6), ("handover", 163, 43), ("banana", 534, 135)):
         transitions = problem(name).transitions
