@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import paper_graphs
 import pytest
 from loaded import problem
 
@@ -64,6 +65,18 @@ def test_wrong_constraints_are_refused_in_one_line(case):
     with pytest.raises(InputError, match=message.replace("(q1)", r"\(q1\)")) as caught:
         cgs_jax.with_constraint(problem("pick_place"), **(FINE | change))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["pick_place", "handover", "banana"])
+def test_graphs_of_the_scenes_are_those_of_the_papers_figure(name):
+    """Variables with their dof; factors with their scopes and equality rows."""
+
+    def factors(graph):
+        return sorted((c.factor, sorted(c.scope), c.equality_rows) for c in graph.constraints)
+
+    ours, drawn = problem(name).graph, getattr(paper_graphs, name)()
+    assert {v.name: (v.dof, v.kind) for v in ours.variables} == {v.name: (v.dof, v.kind) for v in drawn.variables}
+    assert factors(ours) == factors(drawn)
 
 
 @pytest.mark.parametrize("name", ["pick_place", "handover", "banana"])
