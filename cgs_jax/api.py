@@ -51,7 +51,9 @@ def make_chooser(
     """The chooser of a method.
 
     method: "tree" (UCT), "tree-warm" (UCT that starts from `prior`), "rand", the name of a sequence of the task file, or a
-    sequence as text. prior: trees of earlier runs (`tree.json`). Raises InputError for anything else, naming what there is.
+    sequence as text. prior: trees of earlier runs (`tree.json`). c_uct, reward: weight of exploration, and whether the
+    paper's cost c in lambda = 1/(c + 1) is per finished sample ("rate") or per rollout. Raises InputError for anything else,
+    naming what there is. Paper, Section V, Eq. 3.
     """
     transitions = problem.transitions
     sequences = problem.scene.task.sequences
@@ -117,7 +119,7 @@ class RunOptions(TypedDict, total=False):
 
 
 class Run:
-    """One run with its record; iterate `events` to drive it."""
+    """One run with its record; iterate `events` to drive it. Raises InputError for a wrong method. Paper, Algorithm 1."""
 
     def __init__(
         self,
@@ -191,7 +193,7 @@ def stream(
     coverage_gain: float | None = None,
     **options: Unpack[RunOptions],
 ) -> Iterator[SampleSet]:
-    """Like `sample`, but yields verified samples in batches as they come."""
+    """Like `sample`, but yields verified samples in batches as they come. Raises what `sample` raises, when first asked."""
     run = Run(problem, **options)
     for event in run.events(time_budget, num_samples, coverage_gain):
         if isinstance(event, Found) and len(event.qpos):
@@ -216,7 +218,8 @@ def operator(
     values: `(lanes, dim)` of the given variables that the operator reads; `lanes` is needed only where it reads none.
     params: `problem.params`, or other numbers of the same shapes. Returns `(lanes, dim)` per new variable and a mask: rows
     within the solver's tolerance and clearance within `PENETRATION`. Composes with `jax.jit`, `jax.vmap` (over params or
-    keys) and `jax.shard_map` (with `check_vma=False`). Raises InputError for unknown variables, or when given and new overlap.
+    keys) and `jax.shard_map` (with `check_vma=False`). Raises InputError for unknown variables, or when given and new overlap;
+    when called, for missing values or lanes. Paper, Section IV: the operation x_s' = o_{s,s'}(x_s).
 
     cost: a smooth JAX function of some new (and given) variables, its parameters called like them, one lane at a time:
     configurations `(dof,)` in rad or m, poses `(7,)` `[x y z qw qx qy qz]`; returns a number. Every lane then goes on from its
@@ -320,7 +323,9 @@ def conditional(problem: Problem, given: Iterable[str], new: Iterable[str]) -> T
 def rollout(problem: Problem, sequence: str | Iterable, settings: al.Settings | None = None) -> Callable:
     """A whole sequence as one pure function `draw(key, params, lanes) -> (values, feasible)`.
 
-    Lanes that failed stay masked; nothing is refilled. Raises InputError for a text that is no sequence of the graph.
+    key: a JAX key; params: `problem.params` or other numbers of the same shapes. Returns `(lanes, dim)` by variable
+    (configurations in rad or m, poses `[x y z qw qx qy qz]`) and a mask `(lanes,)`. Lanes that failed stay masked; nothing is
+    refilled. Raises InputError for a text that is no sequence of the graph. Paper, Section IV: a sequence of operations.
     """
     path = problem.transitions.parse(sequence)
     operators = [operator(problem, t.given, t.new, settings) for t in path]

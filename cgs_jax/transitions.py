@@ -1,4 +1,4 @@
-"""Transitions between sets of assigned variables, pruned exactly (paper, Section IV-B and Table I).
+"""Transitions between sets of assigned variables, pruned exactly (paper, Section V-B and Table I).
 
 A transition s -> s' assigns the variables new = s' \\ s jointly, given those of s. Its active constraints are those
 whose scope lies inside s' and touches new. It is kept if and only if
