@@ -345,7 +345,7 @@ def test_an_infeasible_scene_names_operator_and_constraint(tmp_path):
     task, out = copied(tmp_path / "scene", edit_task=goal_in_the_wall), tmp_path / "out"
     out.mkdir()
     (out / "samples.npz").write_text("of an earlier run")
-    done = start("--scene", task, "--instance", 8, "--time-budget", 2, "--out", out)
+    done = start("--scene", task, "--instance", 8, "--time-budget", 8, "--out", out)
     assert done.returncode == 3, done.stderr
     told = done.stderr.splitlines()
     assert len(told) == 1, done.stderr
