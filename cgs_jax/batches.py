@@ -235,15 +235,24 @@ class BatchRunner:
         device += time.perf_counter()
         rows_hold = result.feasible[:count]
         iterations = int(result.iterations[:count].sum())
+        named = {name: value[:count] for name, value in operator.named(result).items()}
         failures: dict[str, int] = {}
+        # What a user's sampler drew outside the limits, or was no number, is not finite: no row stopped such a task.
+        open_tasks = ~rows_hold
+        for slot in operator.plan.layout.samplers:
+            drawn = [~np.isfinite(named[name]).all(axis=1) for name in slot.sampler.variables]
+            stopped = open_tasks & np.any(drawn, axis=0)
+            if stopped.any():
+                failures[slot.sampler.link] = int(stopped.sum())
+                open_tasks &= ~stopped
         if operator.measured:
             violation = result.violation[: len(operator.measured), :count]
-            worst = np.argmax(violation[:, ~rows_hold], axis=0)
+            worst = np.argmax(violation[:, open_tasks], axis=0)
             for at, times in zip(*np.unique(worst, return_counts=True), strict=True):
                 failures[operator.measured[at]] = int(times)
         success = np.flatnonzero(rows_hold)
         proposed = len(success)
-        new = {name: value[success] for name, value in operator.named(result).items()}
+        new = {name: value[success] for name, value in named.items()}
         values = {name: value[success] for name, value in batch.conditions.items()} | new
         for position, clear in enumerate(operator.clears, start=1):
             if not len(success):

@@ -124,7 +124,8 @@ class OwnSampler:
     @property
     def link(self) -> str:
         """Name of the constraint without rows that ties what is given to what is drawn, where no other does."""
-        return f"Sampler({','.join(self.variables)}|{','.join(self.given)})"
+        given = f"|{','.join(self.given)}" if self.given else ""
+        return f"Sampler({','.join(self.variables)}{given})"
 
     def draw(self, key: jax.Array, given: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
         """Values by variable, for one lane."""

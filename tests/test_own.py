@@ -193,6 +193,27 @@ def test_a_sampler_reads_what_is_assigned_and_what_was_drawn_before_it():
     np.testing.assert_allclose(point.configurations[0, 0], 10.0 * np.asarray(point.free.position)[0, 2], atol=1e-6)
 
 
+def test_a_failed_draw_is_named_in_the_diagnosis():
+    """Of a sampler whose variable no row reads, and of one that a row reads too."""
+    at = cgs_jax.with_sampler(with_force(0.0, 1.0), "force", lambda key, t: jnp.full((1,), jnp.nan), ("t",))
+    read = cgs_jax.with_constraint(at, "pull", ("force",), lambda force: force - 0.5, "inequality", 1)
+    for problem_at in (at, read):
+        run = cgs_jax.Run(problem_at, "t; force; q1; q2", settings=SMALL)
+        for event in run.events(60.0):
+            if type(event).__name__ == "Ran" and event.path[event.position].new == ("force",):
+                assert event.failures == {"Sampler(force|t)": event.tasks}
+                run.stop()
+        assert "operator force | t succeeded 0 of" in run.record.diagnosis()
+        assert "Sampler(force|t) stopped 100 % of its failures" in run.record.diagnosis()
+    at = cgs_jax.with_sampler(with_force(0.0, 1.0), "force", lambda key: 2.0 * jax.random.uniform(key, (1,)))
+    run = cgs_jax.Run(at, "force; t; q1; q2", settings=SMALL)
+    for event in run.events(60.0):
+        if type(event).__name__ == "Ran" and event.path[event.position].new == ("force",):
+            assert event.failures == {"Sampler(force)": event.tasks - event.cleared}
+            assert 0.3 < event.cleared / event.tasks < 0.7
+            run.stop()
+
+
 def test_samplers_of_configurations_are_the_seeds_that_others_are_judged_by(monkeypatch):
     monkeypatch.setattr(seeds, "JITTER", 0.0)
     monkeypatch.setattr(seeds, "ANYWHERE", 0.0)
