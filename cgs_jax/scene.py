@@ -475,6 +475,8 @@ def _read_grasp(table: _Table) -> TwoFingerGrasp | TouchGrasp:
         rows = table.require("rows")
         if not isinstance(rows, list):
             raise table.fail(f"'rows' must be a list of [gripper axis, object axis, dot product], got {_shown(rows)}")
+        if len(rows) > 3:
+            raise table.fail(f"'rows' has {len(rows)} rows, expected at most 3: a rotation has three degrees of freedom")
         low, high = _bounds(table)
         checked = tuple(_read_row(row, f"{table.where}: rows[{i}]") for i, row in enumerate(rows))
         grasp = TwoFingerGrasp(checked, low, high)

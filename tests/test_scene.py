@@ -488,6 +488,7 @@ def test_instance_out_of_range(instance):
         ("handover", 'kind = "two_finger"', 'kind = "suction"', ["suction", "two_finger, touch"]),
         ("handover", "[[0, 1, 0], [0, 1, 0], 0.0]", "[[0, 1, 0], [0, 1, 0], 1.0]", ["rows[0]", "dot product 1"]),
         ("handover", "[[0, 1, 0], [0, 1, 0], 0.0]", "[[0, 1, 0], [0, 1, 0]]", ["rows[0]"]),
+        ("handover", "rows = [", "rows = [[[0, 0, 1], [1, 0, 0], 0.0], [[0, 0, 1], [0, 1, 0], 0.0], ", ["4 rows", "at most 3"]),
         ("handover", "position = true", "position = 1", ["'position'", "true or false"]),
         ("handover", "position = true\nrotation = true", "", ["asks for nothing"]),
         ("handover", "q_a2,t_a,q_b1", "q_a2,t_c,q_b1", ["expert1", "unknown variable 't_c'"]),
