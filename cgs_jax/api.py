@@ -53,9 +53,14 @@ def make_chooser(
     method: "tree" (UCT), "tree-warm" (UCT that starts from `prior`), "rand", the name of a sequence of the task file, or a
     sequence as text. prior: trees of earlier runs (`tree.json`). c_uct, reward: weight of exploration, and whether the
     paper's cost c in lambda = 1/(c + 1) is per finished sample ("rate") or per rollout. Raises InputError for anything else,
-    naming what there is. Paper, Section V, Eq. 3.
+    naming what there is, and where no sequence assigns all variables. Paper, Section V, Eq. 3.
     """
     transitions = problem.transitions
+    if not transitions.children(frozenset()):
+        raise InputError(
+            f"no sequence assigns all variables of '{problem.name}': some have more equality rows than degrees of freedom, as "
+            "--check lists; fewer are those of a looser grasp, or of a placement with bounds in place of a goal"
+        )
     sequences = problem.scene.task.sequences
     if method == "tree-warm" and not prior:
         raise InputError("method 'tree-warm' needs statistics of earlier runs: give at least one tree (--warm-start FILE)")

@@ -342,7 +342,8 @@ def check(options: argparse.Namespace, folder: Path) -> int:
         line.enter_phase("checking")
         prior = [cgs_jax.load_tree(path) for path in options.warm_start]
         found = cgs_jax.check_problem(problem, options.seed)
-        cgs_jax.make_chooser(problem, options.method, options.seed, prior)
+        if found.pruned:
+            cgs_jax.make_chooser(problem, options.method, options.seed, prior)
         diagram.save(folder / "graph.svg", diagram.describe(problem.graph, problem.scene.task))
     if options.json:
         print(json.dumps(found.as_json(), indent=1))

@@ -341,6 +341,28 @@ def goal_in_the_wall(text):
     )
 
 
+def test_a_task_of_more_rows_than_degrees_of_freedom_is_told_before_sampling(tmp_path, capsys):
+    # An arm of 5 joints and a grasp without slide: 5 + 5 + 6 degrees of freedom, 6 rows of each Kin and 5 of the grasp.
+    def without_two_joints(model):
+        model = re.sub(r'.*name="a_joint[37]" axis.*\n', "", model)
+        return model.replace("0 -.785 0 -2.356 0 1.571 .785 ", "0 -.785 -2.356 0 1.571 ")
+
+    task = copied(
+        tmp_path / "scene",
+        lambda text: re.sub(r'"a_joint3", |, "a_joint7"', "", text).replace("0.055]", "0.0]").replace("-0.0]", "0.0]"),
+        without_two_joints,
+    )
+    out = tmp_path / "out"
+    assert command.main(["--scene", str(task), "--out", str(out)]) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and "no sequence assigns all variables of 'pick_place'" in told[0]
+    assert not out.exists()
+    # The check says the same as a fault among what it lists.
+    assert command.main(["--scene", str(task), "--check", "--out", str(out)]) == 2
+    told = capsys.readouterr()
+    assert "Kin(q1,t)" in told.out and "no sequence assigns all variables" in told.err
+
+
 def test_an_infeasible_scene_names_operator_and_constraint(tmp_path):
     task, out = copied(tmp_path / "scene", edit_task=goal_in_the_wall), tmp_path / "out"
     out.mkdir()
