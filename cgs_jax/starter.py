@@ -35,6 +35,12 @@ CLEARANCE = 0.001
 WIDEST = 0.12
 """Metres up to which a finger is looked for on each side of the tool."""
 
+POSE_JOINTS = 6
+"""Joints from which on an arm reaches full poses, so that the box can have one as its goal."""
+
+PLACE_SPREAD = 0.04
+"""Metres along x and y around the goal at which an arm of fewer joints may put the box."""
+
 OURS = ("table", "box")
 """Names of the scene's own bodies and joints."""
 
@@ -130,6 +136,8 @@ def start_scene(robot: FittedRobot, name: str, grasp: Grasp | None = None) -> St
         x, y = centre + radius * np.array([math.cos(angle), math.sin(angle)])
         places.append((x, y, table + box[2] + CLEARANCE))
     mjcf = robot_mjcf(robot, name, table, overlaps, box, (places[0], places[1]), chosen)
+    if len(robot.joints) < POSE_JOINTS:
+        notes.append(f"{len(robot.joints)} joints reach few full poses: it puts the box near the goal, turned as it comes")
     task = _task_text(robot, name, chosen, box, places[1])
     return Starter(mjcf, task, chosen, box, overlaps, free, busiest, tuple(notes))
 
@@ -450,7 +458,51 @@ def _task_text(
         comment = "# The tool's origin is on one of these sites of the box, its approach (z) points into it; the spin is free."
         sides = ", ".join(f'"box_{side}"' for side in ("top", "front", "back", "left", "right"))
         text = f'{{ kind = "touch", sites = [{sides}] }}'
-    turned = ", ".join(f"{v:.4f}" for v in goal)
+    if len(robot.joints) < POSE_JOINTS:
+        corners = []
+        for part in (1.0, 0.5):
+            spread = part * np.array([PLACE_SPREAD, PLACE_SPREAD, 0.0])
+            corners += [", ".join(f"{v:.4f}" for v in np.array(goal) + sign * spread) for sign in (-1, 1)]
+        where = f"""# An arm of fewer than six joints reaches few full poses: it puts the box near the goal, turned as it comes.
+[[placements]]
+variable = "p"
+object = "box"
+at = "place"
+low = [{corners[0]}]
+high = [{corners[1]}]
+upright = true
+
+[sequences]
+together = "(q1,q2,t,p)"
+pick_first = "(q1,t); (q2,p)"
+
+[[instances]]
+title = "as written"
+
+[[instances]]
+title = "nearer to the goal"
+placement.p = {{ low = [{corners[2]}], high = [{corners[3]}] }}
+"""
+    else:
+        turned = ", ".join(f"{v:.4f}" for v in goal)
+        where = f"""[[goals]]
+object = "box"
+site = "goal"
+at = "place"
+position = true
+rotation = true
+
+[sequences]
+together = "(q1,q2,t)"
+grasp_first = "t; q1; q2"
+
+[[instances]]
+title = "as written"
+
+[[instances]]
+title = "goal turned by 90 degrees"
+site.goal = {{ pos = [{turned}], quat = [0.7071067812, 0, 0, 0.7071067812] }}
+"""
     return f"""# A first task for this robot. All keys: scenes/README.md.
 name = "{name}"
 title = "{robot.name} picks a box and places it"
@@ -481,21 +533,4 @@ to = "place"
 {comment}
 grasp = {text}
 
-[[goals]]
-object = "box"
-site = "goal"
-at = "place"
-position = true
-rotation = true
-
-[sequences]
-together = "(q1,q2,t)"
-grasp_first = "t; q1; q2"
-
-[[instances]]
-title = "as written"
-
-[[instances]]
-title = "goal turned by 90 degrees"
-site.goal = {{ pos = [{turned}], quat = [0.7071067812, 0, 0, 0.7071067812] }}
-"""
+{where}"""

@@ -15,6 +15,7 @@ import pytest
 
 from cgs_jax import fitting, starter
 from cgs_jax.errors import InputError
+from cgs_jax.problems import load_problem
 from cgs_jax.scene import load_scene, load_task
 
 ROOT = Path(__file__).parents[1]
@@ -405,6 +406,32 @@ def test_the_command_tells_what_it_decided_and_writes_three_files(capsys, tmp_pa
     assert command.main([*wanted, "--overwrite", "--no-picture", "--grasp", "touch", "--approach=z"]) == 0
     task = tomllib.loads((tmp_path / "crane" / "crane.toml").read_text())
     assert task["holds"][0]["grasp"]["kind"] == "touch"
+
+
+def test_an_arm_of_five_joints_may_put_the_box_around_the_goal(tmp_path):
+    links, end = "", ""
+    for i, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1")):
+        links += f"<body name='l{i}' pos='0 0 {0.25 if i else 0.05}'><joint name='j{i}' axis='{axis}' range='-2.5 2.5'/>"
+        links += "<geom type='capsule' size='.02' fromto='0 0 0.03 0 0 .2'/>"
+        end += "</body>"
+    (tmp_path / "five.xml").write_text(
+        "<mujoco model='five'><compiler angle='radian'/><worldbody><body name='base'><geom type='box' size='.05 .05 .02'/>"
+        f"{links}<site name='tool' pos='0 0 .22'/>{end}</body></worldbody></mujoco>"
+    )
+    robot = fitting.read_robot(tmp_path / "five.xml")
+    task, start = written(robot, tmp_path / "scene")
+    assert any(note.startswith("5 joints reach few full poses") for note in start.notes)
+    goal = load_scene(task).site_pose("goal")[:3]
+    read = load_task(task)
+    placement = read.placement("p")
+    nearer = read.instances[1].placements["p"]
+    assert placement.upright and nearer["upright"]
+    for low, high in ((placement.low, placement.high), (nearer["low"], nearer["high"])):
+        assert np.all(np.array(low) <= goal + 1e-4) and np.all(goal <= np.array(high) + 1e-4) and low[2] == high[2]
+    # Its pose at the goal would be 6 more rows than degrees of freedom allow; now each named sequence is a path of the graph.
+    problem = load_problem(task)
+    for name, text in problem.scene.task.sequences.items():
+        assert problem.transitions.parse(text), name
 
 
 def test_the_box_fits_between_the_fingers(tmp_path):
