@@ -85,7 +85,8 @@ def load_tree(path: str | Path) -> dict[str, Any]:
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read tree {path}: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"cannot read tree {path}: {reason}") from None
     if not isinstance(data, dict):
         raise InputError(f"{path} is no saved tree, expected a tree.json of an earlier run")
     return data

@@ -269,6 +269,9 @@ class SampleSet:
             raise
         except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if isinstance(error, ValueError) and not zipfile.is_zipfile(source):
+                # NumPy takes whatever is no archive for a pickle, and says how to load it unsafely.
+                reason = "it is no archive"
             raise InputError(f"cannot read {source}: {reason}, expected an .npz with schema {SCHEMA}") from None
         schema = str(stored.get("schema", "none"))
         if schema != SCHEMA:

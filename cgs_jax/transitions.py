@@ -30,6 +30,9 @@ Problem = tuple[tuple[str, ...], tuple[str, ...]]
 
 State = frozenset[str]
 
+LISTED = 12
+"""Transitions that a message lists at most, the smallest ones."""
+
 
 @dataclass(frozen=True)
 class Transition:
@@ -134,9 +137,14 @@ class Transitions:
         state: State = frozenset()
         for number, step in enumerate(steps, start=1):
             names = self._read_step(step, number) if isinstance(step, str) else list(step)
+            unknown = [name for name in names if name not in self.graph.index]
+            if unknown:
+                raise InputError(f"step {number}: unknown variable '{unknown[0]}', available: {', '.join(self.graph.index)}")
             match = next((t for t in self.children(state) if Counter(t.new) == Counter(names)), None)
             if match is None:
-                available = ", ".join(map(str, self.children(state))) or "nothing"
+                children = self.children(state)
+                more = f" and {len(children) - LISTED} more" if len(children) > LISTED else ""
+                available = (", ".join(map(str, children[:LISTED])) or "nothing") + more
                 raise InputError(
                     f"step {number} ({','.join(names)}) is not possible after "
                     f"{self.format(path) or 'the start'!r}; available: {available}"

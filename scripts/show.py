@@ -16,7 +16,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from cgs_jax.errors import InputError
 from cgs_jax.samples import SampleSet
@@ -24,8 +24,15 @@ from cgs_jax.samples import SampleSet
 DEFAULT_CHOICE = "diverse:6"
 
 
-def parse() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
+
+
+def parse() -> Parser:
+    parser = Parser(
         description="Look at samples: contact sheet, animation, ghosts, web page, or MuJoCo's own viewer.",
         epilog="Without --sheet, --gif, --ghost, --report, --view or --mujoco: sheet and GIF are written beside the file.",
     )
@@ -133,9 +140,8 @@ def show(options: argparse.Namespace) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    options = parse().parse_args(arguments)
     try:
-        show(options)
+        show(parse().parse_args(arguments))
     except InputError as error:
         print(f"show.py: {error}", file=sys.stderr)
         return 2

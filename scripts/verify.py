@@ -13,7 +13,9 @@ import glob
 import json
 import os
 import sys
+import zipfile
 from collections import defaultdict
+from typing import NoReturn
 
 import mujoco
 import numpy as np
@@ -75,7 +77,9 @@ def read(path: str) -> dict:
         with np.load(path, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
     except Exception as error:
-        raise BadInput(f"{path} is no readable .npz: {first_line(error)}") from None
+        # NumPy takes whatever is no archive for a pickle, and says how to load it unsafely.
+        other = isinstance(error, ValueError) and not zipfile.is_zipfile(path)
+        raise BadInput(f"{path} is no readable .npz: {'it is no archive' if other else first_line(error)}") from None
     if str(data.get("schema")) != SCHEMA:
         raise BadInput(f"{path} has schema {data.get('schema')}, expected {SCHEMA}")
     missing = [key for key in KEYS if key not in data]
@@ -493,13 +497,20 @@ class Verification:
         return report | {"not_checked": not_checked}
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(message)
+
+
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Check samples in float64 with C MuJoCo and numpy alone.")
+    parser = Parser(description="Check samples in float64 with C MuJoCo and numpy alone.")
     parser.add_argument("file", help="samples.npz, or the directory that holds it")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.add_argument("--limit", type=int, metavar="N", help="check the first N samples only")
-    options = parser.parse_args(arguments)
     try:
+        options = parser.parse_args(arguments)
         if options.limit is not None and options.limit < 1:
             raise BadInput(f"--limit is {options.limit}, expected at least 1")
         verification = Verification(read(options.file), options.limit)

@@ -446,6 +446,8 @@ def test_script_writes_what_is_asked_for(show, tmp_path, capsys, opengl):
         (["--sheet", "a.jpg"], ".png"),
         (["--gif", "a.png"], ".gif"),
         (["--view", "--port", "99999999"], "port"),
+        (["--port", "some"], "--port: invalid int value"),
+        (["--ghosts", "3"], "unrecognized arguments: --ghosts"),
     ],
 )
 def test_script_answers_wrong_input_in_one_line(show, tmp_path, capsys, arguments, words):

@@ -418,7 +418,7 @@ def refused(capsys, out, *arguments):
         ("--scene pick_place --method greedy", "unknown method 'greedy', expected one of: tree, tree-warm, rand, expert1"),
         ("--scene pick_place --method tree-warm", "'tree-warm' needs .*--warm-start FILE"),
         ("--scene pick_place --method rand --warm-start x.json", "no effect on method 'rand', expected one of: tree"),
-        ("--scene pick_place --warm-start nowhere.json", "cannot read tree nowhere.json"),
+        ("--scene pick_place --warm-start nowhere.json", "cannot read tree nowhere.json: No such file or directory$"),
     ],
 )
 def test_wrong_arguments_end_with_status_2_and_one_line(arguments, said, capsys, tmp_path):

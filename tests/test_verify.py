@@ -166,5 +166,10 @@ def test_damaged_file_and_wrong_limit(verify, tmp_path, capsys):
     assert verify.main([str(path)]) == 2
     path.write_bytes(b"PK")
     assert verify.main([str(path)]) == 2
+    path.write_text("a text")
+    assert verify.main([str(path)]) == 2
+    assert verify.main([]) == 2
     errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 3 and "--limit is 0" in errors[0]
+    assert len(errors) == 5 and "--limit is 0" in errors[0]
+    # Not NumPy's advice to load it as a pickle.
+    assert "it is no archive" in errors[3] and "required: file" in errors[4]
