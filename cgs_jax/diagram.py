@@ -23,10 +23,10 @@ _SPACE = 78
 _COLUMN = 124
 """Least width of a column, px."""
 _MARGIN = 26
-_LEGEND = 410
-"""Width of the legend, px."""
+_LEGEND = 300
+"""Width of the legend, px; a task of two switches is not wider, and fits on a phone."""
 _ROWS = {"above": 66, "pose": 132, "kin": 216, "configuration": 300, "below": 366, "pair": 436}
-_HEIGHT = 520
+_HEIGHT = 536
 _COLOURS = {"configuration": "#cfe0f3", "pose": "#f6e2bd", "vector": "#dcecd5"}
 
 
@@ -90,7 +90,7 @@ def draw(described: Mapping[str, Any]) -> str:
         f"<title>{escape(label)}</title>",
         f'<rect width="{width:.0f}" height="{height}" fill="#ffffff"/>',
     ]
-    bottom = height - 44
+    bottom = height - 60
     for k, name in enumerate(described["switches"]):
         left, right = edges[k] + shift, edges[k + 1] + shift
         parts.append(
@@ -194,7 +194,12 @@ def _square(constraint: Mapping[str, Any], x: float, row: str) -> list[str]:
 
 def _legend(x: float, y: float) -> list[str]:
     return [
-        f'<text x="{x:.1f}" y="{y - 8}" font-size="11" fill="#555555">circles: variables and their degrees of freedom</text>',
-        f'<text x="{x:.1f}" y="{y + 8}" font-size="11" fill="#555555">'
-        "squares: constraints and their equality rows (≤: inequalities alone)</text>",
+        f'<text x="{x:.1f}" y="{y + 16 * line - 8}" font-size="11" fill="#555555">{text}</text>'
+        for line, text in enumerate(
+            (
+                "circles: variables and their degrees of freedom",
+                "squares: constraints and their equality rows",
+                "(≤: inequalities alone)",
+            )
+        )
     ]

@@ -148,7 +148,8 @@ pre { background: #f6f8fa; padding: 0.6rem; white-space: pre-wrap; overflow-wrap
   #tree { table-layout: fixed; font-size: 0.8rem; }
   #tree th:first-child { width: 34%; }
   #tree th:nth-child(3) { width: 19%; }
-  .graph { overflow-x: auto; }
+  .graph, .sheet { overflow-x: auto; }
+  .sheet img { max-width: none; width: max(100%, calc(var(--columns) * 15rem)); }
   .graph svg { max-width: none; }
   .step { padding-left: calc(var(--depth) * 0.4em); }
 }
@@ -161,7 +162,9 @@ pre { background: #f6f8fa; padding: 0.6rem; white-space: pre-wrap; overflow-wrap
   thead { display: table-header-group; }
   .bar { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   .pairs { grid-template-columns: 1fr 1fr; }
-  img { max-height: 240mm; }
+  .faint { break-before: avoid; }
+  /* A page of Letter paper holds the sheet with its heading and the line below it. */
+  img { max-height: 220mm; }
 }
 """
 
@@ -416,7 +419,9 @@ def _contact_sheet(samples: SampleSet) -> str:
     few.save(buffer, "PNG", optimize=True)
     text = f"Samples that differ most, one row each; columns: {', '.join(samples.mode_switches)}"
     source = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-    return f'<figure><img alt="{escape(text)}" src="{source}"></figure>\n<p class="faint">{escape(text)}.</p>'
+    columns = len(samples.mode_switches)
+    image = f'<img alt="{escape(text)}" src="{source}">'
+    return f'<figure class="sheet" style="--columns:{columns}">{image}</figure>\n<p class="faint">{escape(text)}.</p>'
 
 
 def _loading(samples: SampleSet) -> str:

@@ -294,10 +294,18 @@ def test_it_fits_a_phone_and_paper_and_asks_for_nothing(copied):
             assert inner == width and wide <= width and long > 2000
             beyond = browser.execute_script(
                 "return [...document.querySelectorAll('p, dd, table, td, figure, svg, img, pre')].filter("
-                "e => !e.closest('.graph svg') && (!e.closest('svg') || e.tagName === 'svg')).filter("
+                "e => !e.closest('.graph svg, .sheet img') && (!e.closest('svg') || e.tagName === 'svg')).filter("
                 "e => e.getBoundingClientRect().right > window.innerWidth + 0.5).map(e => e.outerHTML.slice(0, 80))"
             )
             assert beyond == []
+            # Nothing of the graph is cut off, and a phone shows the graph of two mode switches whole.
+            assert browser.execute_script(
+                "const all = [...document.querySelectorAll('.graph svg, .graph svg text')].map(e => e.getBoundingClientRect());"
+                "return all.every(box => box.left >= all[0].left && box.right <= Math.min(all[0].right, window.innerWidth))"
+            )
+            # The words on the contact sheet are for 320 pixels a column.
+            sheet = browser.execute_script("return document.querySelector('.sheet img').getBoundingClientRect().width")
+            assert sheet / len(SampleSet.load(copied).mode_switches) >= 180
             smallest = browser.execute_script(
                 "return Math.min(...[...document.querySelectorAll('p, dd, dt, td, pre')].filter(e => e.offsetParent)"
                 ".map(e => parseFloat(getComputedStyle(e).fontSize)))"
@@ -312,5 +320,11 @@ def test_it_fits_a_phone_and_paper_and_asks_for_nothing(copied):
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen | {"width": 690})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 690
+        # The sheet, its heading and the line below it go on one page of A4 or Letter: 269 and 251 mm without margins.
+        low, high = browser.execute_script(
+            "const box = e => e.getBoundingClientRect(), sheet = document.querySelector('.sheet');"
+            "return [box(sheet.previousElementSibling).top, box(sheet.nextElementSibling).bottom]"
+        )
+        assert high - low <= 251 / 25.4 * 96
     finally:
         browser.quit()
