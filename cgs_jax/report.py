@@ -76,7 +76,8 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}; expected the folder of a run") from None
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"cannot read {path}: {reason}; expected the folder of a run") from None
     if not isinstance(data, dict):
         raise InputError(f"{path} holds no table, expected the file of a run")
     return data

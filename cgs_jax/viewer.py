@@ -36,6 +36,9 @@ from cgs_jax.samples import SampleSet
 
 Floats = NDArray[np.float64]
 
+SLIDER_PIXELS, MARK_PIXELS = 136.0, 5.0
+"""Length of the page's sliders, and of a letter under them."""
+
 DEFAULT_PORT = 8080
 _ALL = "all sequences"
 _PLANE_EXTENT = 10.0
@@ -192,6 +195,13 @@ def describe(samples: SampleSet, index: int, rows: int = 4) -> str:
 # The web page
 
 
+def switch_marks(names: Sequence[str]) -> tuple[tuple[int, str], ...] | None:
+    """The names under the slider of mode switches; None where two of them would run into each other."""
+    apart = SLIDER_PIXELS / max(len(names) - 1, 1)
+    longest = max((len(a) + len(b)) / 2 for a, b in zip(names, names[1:], strict=False)) if len(names) > 1 else 0.0
+    return tuple(enumerate(names)) if MARK_PIXELS * (longest + 1) <= apart else None
+
+
 class WebViewer:
     """The page of one sample set. It is served from construction on; `stop` ends it.
 
@@ -295,8 +305,7 @@ class WebViewer:
         self._diverse_count = gui.add_number("How many", min(10, many), min=1, max=many, step=1)
         self._sample_slider = gui.add_slider("Sample", 0, len(self._pool) - 1, 1, 0)
         names = samples.mode_switches
-        marks = tuple((i, name) for i, name in enumerate(names)) if len(names) <= 6 else None
-        self._switch_slider = gui.add_slider("Mode switch", 0, len(names) - 1, 1, self._column, marks=marks)
+        self._switch_slider = gui.add_slider("Mode switch", 0, len(names) - 1, 1, self._column, marks=switch_marks(names))
         self._text = gui.add_markdown("")
         self._sites_box = gui.add_checkbox("Show sites", True)
         missing = missing_display()

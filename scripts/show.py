@@ -86,6 +86,8 @@ def show(options: argparse.Namespace) -> None:
     if options.report:
         from cgs_jax import report
 
+        if not options.file.exists():
+            raise InputError(f"no sample file {options.file}, expected a samples.npz or a directory with one")
         print(report.save_report(options.file if options.file.is_dir() else options.file.parent))
         if not (options.sheet or options.gif or options.ghost or options.view or options.mujoco):
             return

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cgs_jax import render
+from cgs_jax import render, viewer
 from cgs_jax.errors import InputError
 from cgs_jax.samples import SampleSet
 
@@ -457,6 +457,18 @@ def test_script_answers_wrong_input_in_one_line(show, tmp_path, capsys, argument
     captured = capsys.readouterr()
     assert captured.out == "" and len(captured.err.splitlines()) == 1 and words in captured.err
     assert os.listdir(tmp_path) == ["samples.npz"]
+
+
+def test_a_report_of_a_folder_that_is_not_there_names_that_folder(show, tmp_path, capsys):
+    assert show.main([str(tmp_path / "gone"), "--report"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"no sample file {tmp_path / 'gone'}, expected" in line
+
+
+def test_names_under_a_slider_do_not_run_into_each_other():
+    assert viewer.switch_marks(("pick", "handover", "place")) == ((0, "pick"), (1, "handover"), (2, "place"))
+    assert viewer.switch_marks(("pick_box", "place_box", "step_on", "pick_banana", "place_banana")) is None
+    assert viewer.switch_marks(("pick",)) == ((0, "pick"),)
 
 
 def test_script_refuses_files_without_samples(show, tmp_path, capsys):
