@@ -282,7 +282,8 @@ def _compile(path: Path, skip_missing: bool) -> tuple[mujoco.MjModel, list[str]]
         if isinstance(error, InputError):
             raise
         remedy = "; its meshes must be where the file's meshdir says" if "opening file" in str(error) else ""
-        raise InputError(f"{path.name} does not compile: {' '.join(str(error).split())}{remedy}") from None
+        said = " ".join(str(error).split()).removeprefix("Error: ")
+        raise InputError(f"{path.name} does not compile: {said}{remedy}") from None
 
 
 def _self_contained_urdf(

@@ -338,7 +338,7 @@ SPHERE = "<geom type='sphere' size='.05'/>"
         ("<mujoco", [], "is no XML"),
         ("<sdf/>", [], "neither an MJCF .* nor a URDF"),
         ("<mujoco><worldbody><geom type='spere'/></worldbody></mujoco>", [], "does not compile"),
-        (arm_of("<geom type='mesh' mesh='x'/>", "<mesh name='x' file='gone.stl'/>"), [], "gone.stl.*meshdir"),
+        (arm_of("<geom type='mesh' mesh='x'/>", "<mesh name='x' file='gone.stl'/>"), [], "compile: Error o.*gone.*meshdir"),
         (urdf("package://toy/gone.stl"), ["--tool", "tip"], "1 mesh files not found .*package://toy/gone.stl.*--skip-missing"),
         (urdf("x.dae", link_mesh=False), [], "say where the tool is.*sites: none; bodies: base, arm, tip"),
         (arm_of(SPHERE), ["--tool", "hand:0,0,1"], "no site or body 'hand'; sites: tool; bodies: base, link"),
