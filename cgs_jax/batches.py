@@ -151,7 +151,7 @@ class BatchRunner:
             self._requested[identity] = futures
 
     def ready(self, operator: Operator) -> bool:
-        """Whether all programs of an operator have been requested and compiled."""
+        """Whether all programs of an operator have been requested and are there: compiled, or in the cache on disk."""
         futures = self._requested.get(operator.identity)
         return futures is not None and all(future.done() for future in futures)
 
@@ -162,19 +162,31 @@ class BatchRunner:
     def _programs(self, operator: Operator) -> list[Future]:
         return [programs.request(*recipe) for recipe in self._recipes(operator)]
 
+    def load(self, operator: Operator) -> None:
+        """Waits for the programs of an operator and reads those that are in the cache; a damaged one is compiled here."""
+        for position, future in enumerate(self.request(operator)):
+            program = future.result()
+            try:
+                program.load()
+            except Exception:  # noqa: BLE001 - whatever is wrong with it
+                self._replace(operator, position)
+
     def _call(self, operator: Operator, position: int, *arguments: Any) -> Any:
         """Runs a program of an operator; one that was compiled elsewhere and fails is compiled here, once."""
         program = self.request(operator)[position].result()
         try:
             return program(*arguments)
         except Exception:
-            if not program.loaded:
+            if not program.foreign:
                 raise
+        return self._replace(operator, position)(*arguments)
+
+    def _replace(self, operator: Operator, position: int) -> programs.Program:
         replaced = programs.request_anew(*self._recipes(operator)[position])
         with self._lock:
             self._requested[operator.identity] = list(self._requested[operator.identity])
             self._requested[operator.identity][position] = replaced
-        return replaced.result()(*arguments)
+        return replaced.result()
 
     def _recipes(self, operator: Operator) -> list[tuple]:
         """Arguments of `programs.request` for each program of an operator."""
@@ -219,8 +231,7 @@ class BatchRunner:
     def run(self, batch: Batch) -> Outcome:
         """Runs one batch and, where it completes samples, audits them. Waits for its programs."""
         operator, problem = operator_of(self.problem, batch.transition), self.problem
-        for future in self.request(operator):
-            future.result()
+        self.load(operator)
         began = time.perf_counter()
         count, room = batch.tasks, self.settings.batch_size
         padded = {name: _fill(batch.conditions[name], room) for name in operator.condition}

@@ -13,9 +13,10 @@ import itertools
 import os
 import pickle
 import platform
+import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NoReturn
@@ -54,15 +55,35 @@ def end_process(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _digest_of_sources() -> str:
+def _digest(paths: Iterable[Path]) -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(paths):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-SOURCES = _digest_of_sources()
+IMPORT = re.compile(r"^\s*from cgs_jax(?:\.(\w+))? import (.*)$", flags=re.M)
+
+
+def imported_by(module: str) -> set[Path]:
+    """Files of this package that a module of it is made of: its own, and those that it imports, directly or not."""
+    found: set[Path] = set()
+    wanted = {module}
+    while wanted:
+        path = Path(__file__).parent / f"{wanted.pop()}.py"
+        if path in found or not path.exists():
+            continue
+        found.add(path)
+        for name, names in IMPORT.findall(path.read_text(encoding="utf-8")):
+            wanted.update([name] if name else map(str.strip, names.split(",")))
+    return found
+
+
+SOURCES = _digest(Path(__file__).parent.glob("*.py"))
 """Digest of this package's text as it was when this process imported it."""
+
+DEVICE_SOURCES = _digest(imported_by("operators"))
+"""Digest of what device programs are made from."""
 
 VARIABLES = ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS")
 """Variables of the environment that change what XLA generates."""
@@ -87,8 +108,8 @@ def _machine() -> str:
 
 
 def _environment() -> str:
-    """What a compiled program depends on besides its key: this package's text, jax and its settings, and the machine."""
-    parts = [SOURCES, _machine(), jax.__version__, jaxlib.__version__, jax.default_backend(), platform.python_version()]
+    """What a compiled program depends on besides its key: the text it is made from, jax and its settings, and the machine."""
+    parts = [DEVICE_SOURCES, _machine(), jax.__version__, jaxlib.__version__, jax.default_backend(), platform.python_version()]
     parts += [f"{name}={os.environ.get(name)}" for name in VARIABLES]
     parts += [f"{name}={jax.config.values.get(name)}" for name in OPTIONS]
     return "\n".join(parts)
@@ -121,54 +142,60 @@ def _store(path: Path, data: bytes) -> None:
             excess -= size
 
 
-def _stored(path: Path | None) -> Program | None:
-    """The program in a file of the cache; None without the file, or where it cannot be read."""
-    if path is None or not path.exists():
-        return None
-    began = time.perf_counter()
-    try:
-        program = load_portable(path.read_bytes())
-    except Exception:  # noqa: BLE001 - a damaged entry is replaced by a new one
-        return None
-    with contextlib.suppress(OSError):
-        os.utime(path)
-    program.seconds = time.perf_counter() - began
-    return program
-
-
 class Program:
-    """One compiled program and what it took to make it."""
+    """One program and what it took to compile it."""
 
-    def __init__(self, name: str, executable: Any, seconds: float, portable: bytes | None = None) -> None:
+    def __init__(
+        self, name: str, executable: Any, seconds: float, portable: bytes | None = None, entry: Path | None = None
+    ) -> None:
+        """entry: file of the cache that has it, in place of the executable: it is read when it is first needed."""
         self.name, self.seconds = name, seconds
         self.number = next(_numbers)
         """Tells the programs of this process apart."""
         self.reported = False
         """Whether a run has counted its compile seconds."""
-        self.loaded = portable is not None
+        self.foreign = portable is not None or entry is not None
         """Whether it was compiled by another process: it may be damaged, or not fit this one."""
         self._executable = executable
         self._portable = portable
+        self._entry = entry
+        self._loading = threading.Lock()
+
+    def load(self) -> None:
+        """Reads it from the cache where that has not been done. Raises whatever is wrong with the entry."""
+        with self._loading:
+            if self._executable is None:
+                self._executable = _deserialize(self.portable)[1]
+                with contextlib.suppress(OSError):
+                    os.utime(self._entry)
 
     def __call__(self, *arguments: Any) -> Any:
         """Runs it and waits for the result; releases the GIL meanwhile."""
+        self.load()
         return jax.block_until_ready(self._executable(*arguments))
 
     @property
     def portable(self) -> bytes | None:
         """The compiled program, to be loaded by another process on this machine (`load_portable`).
 
-        None where JAX keeps a cache of its own: what comes out of that cannot be serialised again.
+        None where JAX keeps a cache of its own: what comes out of that cache cannot be serialised again.
         """
+        if self._portable is None and self._entry is not None:
+            self._portable = self._entry.read_bytes()
         if self._portable is None and not _jax_caches():
             self._portable = pickle.dumps((self.name, serialize_executable.serialize(self._executable)))
         return self._portable
 
 
+def _deserialize(data: bytes) -> tuple[str, Any]:
+    name, parts = pickle.loads(data)
+    return name, serialize_executable.deserialize_and_load(*parts)
+
+
 def load_portable(data: bytes) -> Program:
     """The program of `Program.portable`: no tracing, no compiling."""
-    name, parts = pickle.loads(data)
-    return Program(name, serialize_executable.deserialize_and_load(*parts), 0.0, data)
+    name, executable = _deserialize(data)
+    return Program(name, executable, 0.0, data)
 
 
 def _signature(arguments: Any) -> Any:
@@ -201,7 +228,7 @@ def request_anew(name: str, function: Callable, arguments: tuple, key: str | Non
         path.unlink(missing_ok=True)
     with _lock:
         known = _compiled.get((function, _signature(arguments)))
-        if known is not None and not (known.done() and (known.exception() or known.result().loaded)):
+        if known is not None and not (known.done() and (known.exception() or known.result().foreign)):
             return known
         _compiled.pop((function, _signature(arguments)), None)
     return request(name, function, arguments, key)
@@ -215,9 +242,8 @@ def all_requested() -> list[Future[Program]]:
 
 def _make(name: str, function: Any, shapes: tuple, key: str | None) -> Program:
     path = _entry(key, shapes)
-    program = _stored(path)
-    if program is not None:
-        return program
+    if path is not None and path.exists():
+        return Program(name, None, 0.0, entry=path)
     start = time.perf_counter()
     executable = function.lower(*shapes).compile()
     program = Program(name, executable, time.perf_counter() - start)

@@ -2,6 +2,8 @@
 
 import io
 import pickle
+import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -95,6 +97,16 @@ def test_what_changes_the_generated_code_belongs_to_the_key(folder, monkeypatch,
     assert programs._entry("any", shapes) == before
     with jax.debug_nans(True):
         assert programs._entry("any", shapes) != before
+
+
+def test_programs_are_kept_while_what_they_are_made_from_is_the_same():
+    """The search and the files can change without a new compilation; the solver, or what it imports, cannot."""
+    names = {path.stem for path in programs.imported_by("operators")}
+    loaded = "import sys, cgs_jax.operators; print(*(m[8:] for m in sys.modules if m.startswith('cgs_jax.')))"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
+    # The package itself imports its parts only when they are asked for.
+    assert names == set(done.stdout.split())
+    assert {"augmented_lagrangian", "seeds", "poses"} <= names and not {"uct", "sampler", "report"} & names
 
 
 # ------------------------------------------------------------------ workers
