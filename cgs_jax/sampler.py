@@ -166,14 +166,18 @@ BATCH_SECONDS = 0.04
 LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
-PATIENCE = 2
-"""Batches that may be spent on the step after one that was looked at for the first time."""
+PATIENCE = 4
+"""Batches that may be spent until the step after one that was looked at for the first time is looked at too."""
 
 FEW_HISTORIES = 3
 """Only while that step's operator ran after fewer histories than this: the tree judges it by those alone."""
 
-FIRST_GUESS = 6e-8
-"""Device seconds per task or iteration and squared unknown, before anything has run."""
+FIRST_GUESS = 2e-8
+"""Device seconds per task or iteration and squared unknown, before anything has run: rather too few, so that what was looked at
+first is not given up for it."""
+
+DRAIN = 24
+"""Iterations of all lanes that a batch takes beside those of its tasks: until the last one has ended, lanes stand empty."""
 
 LEAST_UNKNOWNS = 7
 """Programs with fewer unknowns than an arm has joints take as long as if they had so many: copies and clearances remain."""
@@ -194,7 +198,7 @@ class SamplerSettings:
     lanes: int = 128
     """Tasks solved side by side."""
     tries: int = 4
-    """Tries of a condition; it leaves at its first success. 1: the paper's semantics."""
+    """Most tries of a condition, of which as many are made as pay; it leaves at its first success. 1: the paper's semantics."""
     pools: bool = True
     """Whether a failure keeps the components that the operator did not read. False: the paper's semantics."""
     workers: int = 2
@@ -211,38 +215,43 @@ class _Pace:
     """What counted work costs: device seconds per task or iteration of each program, as its larger batches showed.
 
     The measured time of a small batch says little of what the operator would cost if it were chosen: lanes stand empty, and
-    on a busy machine one wait weighs more than the work. A program that only ran small batches is judged by what others
-    cost, in proportion to its squared number of unknowns.
+    on a busy machine one wait weighs more than the work. So what is charged is what the work would cost in a full batch. A
+    program that only ran small batches is judged by what others cost, in proportion to its squared number of unknowns.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, lanes: int, batch_size: int) -> None:
+        self._lanes, self._batch_size = lanes, batch_size
         # Seconds and units of work (tasks and iterations times squared unknowns), discounted, large batches first.
         self._programs: dict[Any, tuple[float, float]] = {}
         self._all = 0.0, 0.0
-        self._work_per_task: dict[int, float] = {}
+        self._steps: dict[int, float] = {}  # by operator: one and the iterations of a task
 
     def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float, look: bool) -> float:
         """Device seconds to charge for a batch, whose measured time is taken into account unless it is a first look.
 
         Looks run in the scheduling process, beside the workers: three on two cores.
         """
-        program, work = operator.plan.layout, (tasks + iterations) * _squared_unknowns(operator)
+        program = operator.plan.layout
         if tasks >= REPRESENTATIVE and not look:
+            work = (tasks + iterations + DRAIN * self._lanes) * _squared_unknowns(operator)
             self._programs[program] = _mixed(self._programs.get(program, (0.0, 0.0)), measured, work, tasks)
             self._all = _mixed(self._all, measured, work, tasks)
-        known = self._work_per_task.get(operator.identity, work / tasks)
-        self._work_per_task[operator.identity] = 0.7 * known + 0.3 * work / tasks
-        return (self._unit(program) or FIRST_GUESS) * work
+        steps = 1.0 + iterations / tasks
+        self._steps[operator.identity] = 0.7 * self._steps.get(operator.identity, steps) + 0.3 * steps
+        return tasks * self._per_task(operator, steps)[0]
 
-    def _unit(self, program: Any) -> float:
-        seconds, work = self._programs.get(program, self._all)
-        return seconds / work if work else 0.0
-
-    def seconds_per_task(self, operator: Operator) -> float:
-        """Expected device seconds per task of a large batch."""
+    def affordable(self, operator: Operator) -> int:
+        """Tasks of a batch that takes about `BATCH_SECONDS`: a look at a slow operator must not cost more than at others."""
         # Before its first batch: about seven iterations.
-        work = self._work_per_task.get(operator.identity, 8.0 * _squared_unknowns(operator))
-        return (self._unit(operator.plan.layout) or FIRST_GUESS) * work
+        return self._per_task(operator, self._steps.get(operator.identity, 8.0))[1]
+
+    def _per_task(self, operator: Operator, steps: float) -> tuple[float, int]:
+        """Device seconds per task of a full batch, and how many tasks that has."""
+        seconds, work = self._programs.get(operator.plan.layout, self._all)
+        unit = _squared_unknowns(operator) * (seconds / work if work else FIRST_GUESS)
+        # Fewer tasks than lanes take as long, and would make the operator look slower still.
+        full = int(min(self._batch_size, max(BATCH_SECONDS / (unit * steps), self._lanes)))
+        return unit * (steps + DRAIN * self._lanes / full), full
 
 
 def _mixed(known: tuple[float, float], seconds: float, work: float, tasks: int) -> tuple[float, float]:
@@ -295,11 +304,12 @@ class _Crew:
         threading.Thread(target=arrive, daemon=True).start()
 
     def run(self, batch: Batch, look: bool) -> Outcome:
-        """Runs a batch on whoever is free; a first look at an operator here, where its programs are loaded already."""
+        """Runs a batch on whoever is free; a first look at an operator, until the workers have arrived, here."""
         if self._refusal is not None:
             raise self._refusal
         operator = operator_of(self._local.problem, batch.transition)
-        if look:
+        complete = self._workers and len(self._arrived) == self._wanted
+        if look and not complete:
             if not self._local.is_aimed(operator):
                 member = self._free.get()
                 try:
@@ -309,7 +319,7 @@ class _Crew:
             return self._local.run(batch)
         member = self._free.get()
         # With all workers there, this process has its core for compiling and deciding.
-        if member is self._local and self._workers and len(self._arrived) == self._wanted:
+        if member is self._local and complete:
             member = self._free.get()
         try:
             if isinstance(member, Worker):
@@ -357,9 +367,11 @@ class Sampler:
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
-        self._pace = _Pace()
+        self._pace = _Pace(s.lanes, s.batch_size)
         self._made: defaultdict[int, set[History]] = defaultdict(set)  # by operator
         self._pursued: Path = ()
+        self._steady: Path = ()  # the last one that was no look
+        self._looked_at: set[History] = set()  # now, in a first batch
         self._patience = 0
         self._announced: set[int] = set()
         self._full = problem.transitions.full
@@ -432,7 +444,7 @@ class Sampler:
         yield Started(start - begun)
         found = 0
         reason = "time"
-        threads = ThreadPoolExecutor(self.settings.workers, thread_name_prefix="sample")
+        threads = ThreadPoolExecutor(self.settings.workers + 1, thread_name_prefix="sample")
         in_flight: list[tuple[_Job, Future[Outcome]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
         try:
@@ -447,7 +459,8 @@ class Sampler:
                     reason = "samples"
                     break
                 # What is decided must not depend on when the workers arrive.
-                most = self.settings.workers if self.settings.deterministic else crew.size
+                # One more than run at once waits, so that no worker does.
+                most = self.settings.workers if self.settings.deterministic else crew.size + 1
                 while len(in_flight) < most:
                     job = self._next_job()
                     if job is None:
@@ -543,7 +556,6 @@ class Sampler:
         What that is worth may depend on how its inputs came about as much as tenfold, and nothing else would show it.
         """
         if self._patience > 0:
-            self._patience -= 1
             return self._pursued
         if self.settings.deterministic:
             path = self.chooser.select(None)
@@ -559,6 +571,14 @@ class Sampler:
         path = self._choose()
         if not path:
             return None
+        job = self._job_of(path)
+        # Before the first look at a step is over, a second one would tell the same.
+        if job is None:
+            job = self._job_of(self._steady) if self._steady else None
+        return job or self._job_of(path, again=True)
+
+    def _job_of(self, path: Path, again: bool = False) -> _Job | None:
+        """The batch that the sequence needs most; None where that is being looked at for the first time, unless `again`."""
         steps = self._steps_of(path)
         makers = {step.makes: position for position, step in enumerate(steps)}
         ends = (steps[-1].makes, *self._final_histories(path))
@@ -571,7 +591,7 @@ class Sampler:
             # A sequence that is new is followed down with small batches: what it is worth shows only at its end.
             visits = self._visits.get(slot, 0)
             young = visits < 2
-            most = self._affordable(step.operator)
+            most = self._pace.affordable(step.operator)
             if visits < LOOKS:
                 most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.
@@ -579,21 +599,29 @@ class Sampler:
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
                 count = most
+                if visits and slot in self._looked_at and not again:
+                    return None
+                if not visits:
+                    self._looked_at.add(slot)
+                if not young:
+                    self._steady = path
                 self._made[step.operator.identity].add(slot)
-                if visits == 0 and position + 1 < len(steps):
-                    known = len(self._made[steps[position + 1].operator.identity])
-                    self._patience = PATIENCE if known < FEW_HISTORIES else 0
-                elif not young:
-                    self._patience = 0
+                if path is self._pursued:
+                    self._pursue(steps, position, visits)
                 self._visits[slot] = self._visits.get(slot, 0) + 1
                 return self._job(path, position, step, waiting, count, young)
             position = makers[scarcest]
 
-    def _affordable(self, operator: Operator) -> int:
-        """Tasks of a batch that takes about `BATCH_SECONDS`: a look at a slow operator must not cost more than at others."""
-        affordable = BATCH_SECONDS / self._pace.seconds_per_task(operator)
-        # Fewer tasks than lanes take as long, and would make the operator look slower still.
-        return int(min(self.settings.batch_size, max(affordable, self.settings.lanes)))
+    def _pursue(self, steps: tuple[_Step, ...], position: int, visits: int) -> None:
+        """Notes how long the chosen sequence is kept, a batch of a step after so many being made now."""
+        if visits == 0:
+            following = steps[position + 1 : position + 2]
+            known = len(self._made[following[0].operator.identity]) if following else FEW_HISTORIES
+            self._patience = PATIENCE if known < FEW_HISTORIES else 0
+        elif visits >= 2:
+            self._patience = 0
+        else:
+            self._patience = max(self._patience - 1, 0)
 
     def _pool(self, history: History) -> Pool:
         return self._pools.setdefault(history, Pool())
@@ -625,9 +653,11 @@ class Sampler:
 
     def _absorb(self, job: _Job, outcome: Outcome, elapsed: float) -> Iterator[Event]:
         success = outcome.success
+        self._looked_at.discard(job.step.makes)
         given_up = ~success
         if job.step.reads:
-            given_up &= job.tries + 1 >= self.settings.tries
+            worthwhile = self.chooser.tries(job.path[: job.position], job.step.transition)
+            given_up &= job.tries + 1 >= min(self.settings.tries, worthwhile)
             again = ~success & ~given_up
             if again.any():
                 part = {name: value[again] for name, value in job.batch.conditions.items()}

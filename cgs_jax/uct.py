@@ -1,4 +1,4 @@
-"""Which conditional operator to run next: upper confidence trees over assignment sequences (paper, Section IV-A).
+"""Which conditional operator to run next: upper confidence trees over assignment sequences (paper, Section V-A).
 
 What differs from plain UCT, and why:
 
@@ -33,6 +33,7 @@ from functools import cached_property
 from typing import Any, Literal, Protocol
 
 from cgs_jax.errors import InputError
+from cgs_jax.graph import ConstraintGraph
 from cgs_jax.transitions import Problem, State, Transition, Transitions
 
 SCHEMA = "cgs_jax.tree/2"
@@ -44,8 +45,14 @@ Counts = int | Sequence[int]
 PRIOR_TRIES = 2.0
 """Weight of the prior of an operator without statistics, in tries."""
 
-PRIOR_SUCCESS = 0.7
-"""Guessed success of an operator that never ran, per new variable."""
+SUCCESS_PER_FREEDOM = 0.1
+"""Guessed success of a loop that an operator which never ran has to close, per degree of freedom that is left for it."""
+
+SUCCESS_BOUNDS = 0.03, 0.8
+"""Bounds of that guess."""
+
+HARDNESS_LOOPS = 3.0
+"""Weight, in loops, of the belief that an instance is as hard as guessed."""
 
 CORRELATION = 0.03
 """Guess of how much of the variance of success lies between the histories of an operator (`_Records._trust`)."""
@@ -75,8 +82,14 @@ HOPE = 0.5
 PRICE_STEPS = 2
 """Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
-CURIOSITY = 0.1
-"""First trials of operators come first, smallest first, up to this share of the device time."""
+CURIOSITY = 0.05
+"""First trials of operators may take this share of the device time."""
+
+CURIOUS_AFTER = 30
+"""Batches per operator of the graph, after which those that seem hopeless by their number of rows have a first trial too."""
+
+CURIOUS_EVERY = 16
+"""Only one choice in so many asks for a first trial: what it reads may have to be made before, and that takes time too."""
 
 
 @dataclass
@@ -116,11 +129,16 @@ class Statistics:
         return sum(self.attempts)
 
     def hazards(self, prior: Sequence[float], weight: float) -> list[float]:
-        """Success of each try: the counts, and `prior` with a weight in tries."""
+        """Success of each try: the counts, and a guess with a weight in tries.
+
+        Of the first try that is `prior`; of a later one what came out for the try before, which it goes below as in `prior`.
+        """
         result: list[float] = []
         for k in range(max(len(self.attempts), len(prior))):
-            if k < len(prior):
-                guess, trust = prior[k], weight
+            if k == 0:
+                guess, trust = prior[0], weight
+            elif k < len(prior):
+                guess, trust = result[-1] * min(prior[k] / max(prior[k - 1], 1e-12), 1.0), weight
             else:
                 guess, trust = result[-1], NEXT_TRY
             if k < len(self.attempts):
@@ -131,11 +149,11 @@ class Statistics:
     @property
     def success_rate(self) -> float | None:
         """Success per condition within its tries; None without evidence."""
-        return _within(self._observed)[0] if self._observed else None
+        return _within(self._observed)[-1][0] if self._observed else None
 
     @property
     def seconds_per_condition(self) -> float | None:
-        return _within(self._observed)[1] * self.seconds / self.tries if self._observed else None
+        return _within(self._observed)[-1][1] * self.seconds / self.tries if self._observed else None
 
     @property
     def seconds_per_try(self) -> float | None:
@@ -151,7 +169,7 @@ class Statistics:
 class Totals:
     """Of a whole run: batches, rollouts (attempts at the root), finished samples, device seconds, and those of first trials.
 
-    Rollouts, samples and seconds are discounted.
+    All but batches are discounted.
     """
 
     visits: float = 0.0
@@ -183,33 +201,47 @@ class Chooser(Protocol):
         visits: float = 1.0,
     ) -> None: ...
 
+    def tries(self, prefix: Path, transition: Transition) -> int: ...
+
+
+@dataclass(frozen=True)
+class _Outlook:
+    """What all operators of a run say of those that have not run.
+
+    trust: weight of an operator's pooled success in what is expected after a history, in tries. slowness: device seconds over
+    guessed ones. ease: success over the guessed one, per loop.
+    """
+
+    trust: float = 1.0 / CORRELATION - 1.0
+    slowness: float = 1.0
+    ease: float = 1.0
+
 
 class _Operator:
     """Pooled statistics of one conditional problem, and what they predict."""
 
-    __slots__ = (
-        "cost", "guess", "hazards", "hopeful_cost", "hopeful_success", "prior", "ready", "seconds_per_try", "statistics",
-        "success",
-    )  # fmt: skip
+    __slots__ = ("guess", "hazards", "hopeful", "loops", "per_loop", "ready", "seconds_per_try", "statistics", "within")
 
-    def __init__(self, problem: Problem, guess: float) -> None:
+    def __init__(self, loops: int, per_loop: float, guess: float, outlook: _Outlook) -> None:
         self.statistics = Statistics()
         self.ready = True
-        self.prior = PRIOR_SUCCESS ** len(problem[0])
+        self.loops, self.per_loop = loops, per_loop  # guess of success
         self.guess = guess  # seconds per try
-        self.predict(1.0 / CORRELATION - 1.0)
+        self.predict(outlook)
 
-    def predict(self, trust: float) -> None:
-        """trust: weight of the pooled success in what is expected after a history, in tries."""
+    def predict(self, outlook: _Outlook) -> None:
         known = self.statistics
-        self.hazards = known.hazards([self.prior], PRIOR_TRIES)
-        self.success, tries = _within(self.hazards)
+        prior = min(outlook.ease * self.per_loop, SUCCESS_BOUNDS[1]) ** self.loops if self.loops else self.per_loop
+        self.hazards = known.hazards([prior], PRIOR_TRIES)
         # The guessed cost counts only until a cost was seen: it may be wrong by orders of magnitude.
-        self.seconds_per_try = known.seconds / known.tries if known.tries else self.guess
-        self.cost = tries * self.seconds_per_try
-        # After a history that was never tried.
-        self.hopeful_success, tries = _hopeful(self.hazards, trust)
-        self.hopeful_cost = tries * self.seconds_per_try
+        self.seconds_per_try = known.seconds / known.tries if known.tries else outlook.slowness * self.guess
+        self.within = _within(self.hazards)
+        # After a history that was never tried: it may do as well as was guessed, whatever others did.
+        self.hopeful = _within([max(h, prior) for h in _hopeful(self.hazards, outlook.trust)])
+
+    def seconds_per_item(self, item_cost: float) -> float:
+        """With as many tries as are worth making, when what is read costs so many seconds."""
+        return min((item_cost + tries * self.seconds_per_try) / max(success, 1e-12) for success, tries in self.within)
 
 
 class _Step:
@@ -231,13 +263,13 @@ class _Step:
 class _History:
     """How a component came about: the operator that completed it and the histories that it read.
 
-    success, cost: expected, per condition. item_cost: expected device seconds per item of the component, with all that it
-    was made of. prefixes: sequences by which it was made, none before.
+    tries: of a condition that are worth making. success, cost: expected, per condition. item_cost: expected device seconds
+    per item of the component, with all that it was made of. prefixes: sequences by which it was made, none before.
     """
 
     __slots__ = (
         "cost", "hopeful_cost", "hopeful_success", "item_cost", "made", "operator", "prefixes", "reads", "statistics",
-        "success", "version",
+        "success", "tries", "version",
     )  # fmt: skip
 
     def __init__(self, operator: _Operator, reads: tuple[_History, ...], made: State) -> None:
@@ -246,6 +278,7 @@ class _History:
         self.made = made
         self.statistics = Statistics()
         self.prefixes: list[Path] = []
+        self.tries = 1
         self.success = self.cost = self.item_cost = self.hopeful_success = self.hopeful_cost = 0.0
         self.version = -1
 
@@ -258,11 +291,16 @@ class _History:
             per_try = (own.seconds + OPERATOR_TIME_TRIES * operator.seconds_per_try) / (own.tries + OPERATOR_TIME_TRIES)
         else:
             hazards, known, per_try = operator.hazards, trust, operator.seconds_per_try
-        self.success, tries = _within(hazards)
-        self.cost = tries * per_try
-        self.hopeful_success, tries = _hopeful(hazards, known)
+        read_cost = sum(read.item_cost for read in self.reads)
+        self.item_cost = math.inf
+        for k, (success, tries) in enumerate(_within(hazards), start=1):
+            item_cost = (read_cost + tries * per_try) / max(success, 1e-12)
+            if item_cost < self.item_cost:
+                self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
+        self.hopeful_success, tries = _within(_hopeful(hazards, known))[self.tries - 1]
+        if own.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
+            self.hopeful_success, tries = operator.hopeful[self.tries - 1]
         self.hopeful_cost = tries * per_try
-        self.item_cost = (sum(read.item_cost for read in self.reads) + self.cost) / max(self.success, 1e-12)
 
 
 class _Edge:
@@ -321,10 +359,10 @@ class _Records:
         self._histories: dict[tuple, _History] = {}
         self._known: list[_History] = []  # with statistics of their own
         self._nodes: dict[frozenset[_History], _Node] = {}
+        self._outlook = _Outlook()
         self._root = self._node_of(frozenset(), ())
         self._total = Totals()
         self._version = 0  # of the predictions
-        self._trust = 1.0 / CORRELATION - 1.0
 
     # What happened
 
@@ -354,8 +392,7 @@ class _Records:
             )
         lineage = self._follow((*prefix, transition))
         history = lineage[-1].history
-        if not history.operator.statistics.visits:
-            self._total.first_trials += seconds
+        is_first_trial = not history.operator.statistics.visits
         self._name(lineage[-1], (*prefix, transition))
         # A batch that hardly tells anything hardly counts as a visit.
         visits *= min(1.0, sum(attempts) / VISIT_TRIES)
@@ -367,6 +404,7 @@ class _Records:
         total.rollouts = keep * total.rollouts + (0 if prefix else sum(attempts))
         total.samples = keep * total.samples + (sum(successes) if transition.target == self.transitions.full else 0)
         total.seconds = keep * total.seconds + seconds
+        total.first_trials = keep * total.first_trials + (seconds if is_first_trial else 0.0)
         self._recorded(lineage)
 
     def _recorded(self, lineage: list[_Edge]) -> None:
@@ -392,7 +430,7 @@ class _Records:
         """Predicted finished samples per second of device time when only this sequence is run.
 
         Uses the statistics of its own histories where there are some, those of its operators otherwise, and a guess
-        (PRIOR_SUCCESS at `initial_cost`) for an operator that never ran. Raises InputError for an incomplete sequence.
+        (`guessed_success` at `initial_cost`) for an operator that never ran. Raises InputError for an incomplete sequence.
         """
         path = tuple(path)
         state: State = path[-1].target if path else frozenset()
@@ -402,6 +440,22 @@ class _Records:
         self._predict_operators()
         return self._rate_of(path)
 
+    def tries(self, prefix: Path, transition: Transition) -> int:
+        """How many tries of a condition of `transition` after `prefix` are worth making: the later ones succeed less often.
+
+        More than one try makes sense where a condition costs much to replace: as many as make the least device seconds per
+        success, with all that the condition is made of.
+        """
+        return self._renewed(self._follow((*prefix, transition))[-1].history).tries
+
+    def _renewed(self, history: _History) -> _History:
+        """With predictions by what is known now."""
+        for read in history.reads:
+            self._renewed(read)
+        history.operator.predict(self._outlook)
+        history.predict(self._outlook.trust)
+        return history
+
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
         """The k sequences of greatest predicted rate, with that rate, out of operators that have run.
 
@@ -409,7 +463,10 @@ class _Records:
         differ only in the order of independent steps, and then have equal rates.
         """
         self._predict_operators()
-        paths = self._cheapest_paths(k) if self._states is not None else self._finished_paths()
+        if self._states is not None:
+            paths = self._cheapest_paths(k, lambda step: step.operator.statistics.visits > 0)[self.transitions.full]
+        else:
+            paths = self._finished_paths()
         ranked = sorted(((path, self._rate_of(path)) for path in paths), key=lambda pair: -pair[1])
         return ranked[:k]
 
@@ -424,28 +481,29 @@ class _Records:
         full = self.transitions.full
         return [history.prefixes[0] for history in self._known if history.prefixes[0][-1].target == full]
 
-    def _cheapest_paths(self, k: int) -> list[Path]:
-        """Forward search that keeps in every state the k partial sequences of least production cost."""
+    def _cheapest_paths(self, k: int, among: Callable[[_Step], bool]) -> dict[State, list[Path]]:
+        """In every state the k partial sequences of least production cost, out of some steps, by a forward search."""
         partial: dict[State, list[tuple[float, tuple[_History, ...], Path]]] = {state: [] for state in self._states}
         partial[frozenset()] = [(0.0, (), ())]
         for state in self._states:
             labels = sorted(partial[state], key=lambda label: label[0])[:k]
             partial[state] = labels
             for step in self._steps_from(state).values():
-                if step.operator.statistics.visits <= 0:
+                if not among(step):
                     continue
                 for _, components, path in labels:
                     history, kept = self._made_by(step, components)
                     after = (*kept, history)
                     cost = sum(self._predicted(component).item_cost for component in after)
                     partial[step.target].append((cost, after, (*path, step.transition)))
-        return [path for _, _, path in partial[self.transitions.full]]
+        return {state: [path for _, _, path in labels] for state, labels in partial.items()}
 
     def _predict_operators(self) -> None:
         """Renew what operators predict; histories follow when they are asked."""
-        self._trust = 1.0 / self._correlation() - 1.0
+        known = [operator for operator in self._operators.values() if operator.statistics.tries]
+        self._outlook = _Outlook(1.0 / self._correlation() - 1.0, _slowness(known), _ease(known))
         for operator in self._operators.values():
-            operator.predict(self._trust)
+            operator.predict(self._outlook)
         self._version += 1
 
     def _correlation(self) -> float:
@@ -473,7 +531,7 @@ class _Records:
         if history.version != self._version:
             for read in history.reads:
                 self._predicted(read)
-            history.predict(self._trust)
+            history.predict(self._outlook.trust)
             history.version = self._version
         return history
 
@@ -495,7 +553,8 @@ class _Records:
             # The work of a solve grows with the square of its unknowns, and those are mostly configurations.
             kinds = [self.transitions.graph.variable(name).kind for name in problem[0]]
             guess = self.initial_cost * max(kinds.count("configuration"), 1) ** 2
-            operator = self._operators[problem] = _Operator(problem, guess)
+            loops, per_loop = guessed_success(self.transitions.graph, problem)
+            operator = self._operators[problem] = _Operator(loops, per_loop, guess, self._outlook)
         return operator
 
     def _steps_from(self, state: State) -> dict[tuple[str, ...], _Step]:
@@ -631,7 +690,7 @@ class _Records:
         return edge.history
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
-        """Start from earlier instances of the same graph (paper, Section IV-C).
+        """Start from earlier instances of the same graph (paper, Section V-C).
 
         Per history and per operator the average over the earlier instances of success and of seconds per try, not of Q:
         the price of time may be another one here. Weight: `n_equiv` visits, in batches of the mean size there, but no
@@ -705,6 +764,8 @@ class Tree(_Records):
         self._below: dict[State, tuple[float, float] | None] = {}  # value and reach by state, from operators alone
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
+        self._choices = 0
+        self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
         self._epoch = 0  # of the values: they change with the price too
         self._edges_evaluated = 0
         self._records_since_refresh = 0
@@ -733,7 +794,13 @@ class Tree(_Records):
         if self._stale:
             self._refresh()
         price = self.price
-        node, path = self._root, []
+        self._choices += 1
+        if self._curious:
+            untried = self._path_to_untried()
+            if untried:
+                return untried
+        node = self._root
+        path: list[Transition] = []
         while node.state != self.transitions.full:
             edges = self._expand(node)
             if not node.visited:
@@ -756,7 +823,38 @@ class Tree(_Records):
 
     @property
     def _curious(self) -> bool:
-        return self._states is not None and self._total.first_trials <= CURIOSITY * self._total.seconds
+        if self._states is None or self._choices % CURIOUS_EVERY:
+            return False
+        if self._total.visits < CURIOUS_AFTER * len(self._representatives):
+            return False
+        return self._total.first_trials <= CURIOSITY * self._total.seconds
+
+    def _path_to_untried(self) -> Path:
+        """A sequence with an operator that never ran: the smallest one after the cheapest prefix; () where all have run."""
+        found: tuple[tuple[float, int], Path] | None = None
+        for state, steps in self._backwards:
+            for path in self._prefixes.get(state, []):
+                for step, _ in steps:
+                    size = step.operator.guess, len(path)
+                    if not step.operator.statistics.visits and step.operator.ready and (found is None or size < found[0]):
+                        found = size, (*path, step.transition)
+        return self._completed(found[1]) if found else ()
+
+    def _completed(self, path: Path) -> Path:
+        """The sequence with the steps of greatest value behind, by operators alone."""
+        while path[-1].target != self.transitions.full:
+            best = None
+            for step in self._steps_from(path[-1].target).values():
+                beyond = self._below.get(step.target)
+                if step.operator.ready and beyond is not None:
+                    success = step.operator.hopeful[-1][0]
+                    value = success * beyond[0] - self.price * step.operator.hopeful[-1][1] * step.operator.seconds_per_try
+                    if best is None or value > best[0]:
+                        best = value, step.transition
+            if best is None:
+                return ()
+            path = (*path, best[1])
+        return path
 
     def _most_promising(self, edges: list[_Edge]) -> _Edge:
         """Paper, Eq. 3, with Q normalised among siblings; ties go to the first.
@@ -769,11 +867,7 @@ class Tree(_Records):
             pooled = edge.step.operator.statistics.visits
             own = edge.history.statistics.visits
             count = own + min(max(pooled - own, 0.0), self.equivalent_visits)
-            if count <= 0.0:
-                if self._curious:
-                    return edge  # never tried anywhere: infinite bonus, smallest first
-                count = UNTRIED_VISITS
-            counts.append(count)
+            counts.append(count or UNTRIED_VISITS)
         greatest = max(edges, key=lambda edge: edge.quality)
         # Fractions of a batch would make the logarithm negative, hence 1 +.
         log_n = math.log(1.0 + sum(counts))
@@ -850,8 +944,8 @@ class Tree(_Records):
             self._stale = True
         if self._stale:
             return
-        made.operator.predict(self._trust)
-        made.predict(self._trust)
+        made.operator.predict(self._outlook)
+        made.predict(self._outlook.trust)
         price = self.price
         for edge, node in zip(reversed(lineage), reversed([self._root, *map(self._behind, lineage[:-1])])):
             self._evaluate_edge(edge, price)
@@ -869,17 +963,27 @@ class Tree(_Records):
         """Recompute all predictions: operators, values by state, and the tree."""
         self._predict_operators()
         self._attainable = 0.0
-        if self._states is None:
-            self._per_variable = self._share_among_variables()
-        self._value_at(self.price)
-        for _ in range(PRICE_STEPS if self.reward == "rate" else 0):
-            attainable = self._rate_of_the_best()
-            if attainable <= 1.1 * self.price:
-                break
-            self._attainable = attainable
+        if self._states is not None:
+            greatest = self._greatest_rate()
+            if self.reward == "rate":
+                self._attainable = greatest
             self._value_at(self.price)
+        else:
+            self._per_variable = self._share_among_variables()
+            self._value_at(self.price)
+            for _ in range(PRICE_STEPS if self.reward == "rate" else 0):
+                attainable = self._rate_of_the_best()
+                if attainable <= 1.1 * self.price:
+                    break
+                self._attainable = attainable
+                self._value_at(self.price)
         self._records_since_refresh = 0
         self._stale = False
+
+    def _greatest_rate(self) -> float:
+        """Predicted rate of the best of all sequences that are ready; 0 without one. For small graphs."""
+        self._prefixes = self._cheapest_paths(1, lambda step: step.operator.ready)
+        return max(map(self._rate_of, self._prefixes[self.transitions.full]), default=0.0)
 
     def _value_at(self, price: float) -> None:
         """Values of all states and nodes at a price of time."""
@@ -891,7 +995,7 @@ class Tree(_Records):
         self._evaluate(self._root, price)
 
     def _rate_of_the_best(self) -> float:
-        """Predicted rate of the sequence of greatest Q; 0 where it was not run yet to the end."""
+        """Predicted rate of the sequence of greatest Q; 0 where it was not run yet to the end. For large graphs."""
         node = self._root
         while node.state != self.transitions.full:
             edges = node.edges.values() if node.visited else ()
@@ -934,12 +1038,8 @@ class Tree(_Records):
         """
         costs: dict[State, float] = {}
         for step, _ in self._by_made:
-            operator = step.operator
-            if operator.ready:
-                cost = operator.cost
-                for component in step.used:
-                    cost += costs.get(component, math.inf)
-                cost /= operator.success
+            if step.operator.ready:
+                cost = step.operator.seconds_per_item(sum(costs.get(component, math.inf) for component in step.used))
                 if cost < costs.get(step.made, math.inf):
                     costs[step.made] = cost
         below = self._below
@@ -949,12 +1049,12 @@ class Tree(_Records):
                 operator, beyond = step.operator, below[step.target]
                 if beyond is None or not operator.ready:
                     continue
-                success, cost = operator.hopeful_success, operator.hopeful_cost
-                for component in kept:
-                    cost -= (1.0 - success) * costs.get(component, 0.0)
-                quality = success * beyond[0] - price * cost
-                if best is None or quality > best[0]:
-                    best = quality, success * beyond[1]
+                at_stake = sum(costs.get(component, 0.0) for component in kept)
+                for success, tries in operator.hopeful:
+                    cost = tries * operator.seconds_per_try - (1.0 - success) * at_stake
+                    quality = success * beyond[0] - price * cost
+                    if best is None or quality > best[0]:
+                        best = quality, success * beyond[1]
             below[state] = best
 
     def _with_kept(self, state: State) -> list[tuple[_Step, tuple[State, ...]]]:
@@ -998,7 +1098,8 @@ class Tree(_Records):
         shares: dict[str, tuple[float, float]] = {}
         for (new, _), operator in self._operators.items():
             if operator.statistics.attempts and operator.ready:
-                success, cost = operator.success ** (1.0 / len(new)), operator.cost / len(new)
+                within, tries = operator.within[-1]
+                success, cost = within ** (1.0 / len(new)), tries * operator.seconds_per_try / len(new)
                 for name in new:
                     if name not in shares or shares[name][0] < success:
                         shares[name] = success, cost
@@ -1086,6 +1187,42 @@ class Random(_Records):
         return tuple(path)
 
 
+def _slowness(operators: Iterable[_Operator]) -> float:
+    """Device seconds over guessed ones."""
+    guessed = sum(operator.statistics.tries * operator.guess for operator in operators)
+    return sum(operator.statistics.seconds for operator in operators) / guessed if guessed else 1.0
+
+
+def _ease(operators: Iterable[_Operator]) -> float:
+    """Geometric mean of the success of first tries over the guessed one, per loop: how an instance differs from others."""
+    total, loops = 0.0, HARDNESS_LOOPS
+    for operator in operators:
+        known = operator.statistics
+        if operator.loops and known.attempts[0] >= VISIT_TRIES:
+            success = (known.successes[0] + 0.5) / (known.attempts[0] + 1.0)
+            total += math.log(success) - operator.loops * math.log(operator.per_loop)
+            loops += operator.loops
+    return math.exp(total / loops)
+
+
+def guessed_success(graph: ConstraintGraph, problem: Problem) -> tuple[int, float]:
+    """Number of loops that an operator has to close, and guessed success of each, from dof and rows alone.
+
+    Each new configuration, and each equality that ties poses alone to what is given, is a loop that has to close. What is
+    left of the degrees of freedom after all rows is shared among them: on the scenes here an arm reaches a fixed pose in
+    about one try in ten, a grasp that may be chosen along with it in one of four, and operators with several
+    configurations succeed as the product of such shares.
+    """
+    new, names = frozenset(problem[0]), set(problem[1])
+    active = [constraint for constraint in graph.constraints if constraint.name in names]
+    free = sum(graph.variable(name).dof for name in new) - sum(constraint.equality_rows for constraint in active)
+    configurations = [name for name in new if graph.variable(name).kind == "configuration"]
+    ties = [c for c in active if c.equality_rows and len(c.scope) > 1 and not new.intersection(configurations, c.scope)]
+    loops = len(configurations) + len(ties)
+    least, most = SUCCESS_BOUNDS
+    return loops, min(max(SUCCESS_PER_FREEDOM * free / loops, least), most) if loops else most
+
+
 def _bonus(x: float) -> float:
     """sqrt(x) with x = ln N / n_i as in the paper, but x^2 / 4 where that is more: for n_i below 0.4 ln N.
 
@@ -1096,18 +1233,19 @@ def _bonus(x: float) -> float:
     return max(math.sqrt(x), 0.25 * x * x)
 
 
-def _hopeful(hazards: Sequence[float], tries: float) -> tuple[float, float]:
-    """As `_within`, for hazards above their means by HOPE standard deviations of a beta distribution of that weight."""
-    return _within([min(h + HOPE * math.sqrt(h * (1.0 - h) / (tries + 1.0)), 1.0) for h in hazards])
+def _hopeful(hazards: Sequence[float], tries: float) -> list[float]:
+    """Hazards above their means by HOPE standard deviations of a beta distribution of that weight."""
+    return [min(h + HOPE * math.sqrt(h * (1.0 - h) / (tries + 1.0)), 1.0) for h in hazards]
 
 
-def _within(hazards: Sequence[float]) -> tuple[float, float]:
-    """Success within all tries, and the mean number of tries, when try k succeeds with probability hazards[k]."""
-    failed, tries = 1.0, 0.0
+def _within(hazards: Sequence[float]) -> list[tuple[float, float]]:
+    """For one try, two tries and so on: success within them and their mean number, try k succeeding with hazards[k]."""
+    failed, tries, result = 1.0, 0.0, []
     for hazard in hazards:
         tries += failed
         failed *= 1.0 - hazard
-    return 1.0 - failed, tries
+        result.append((1.0 - failed, tries))
+    return result
 
 
 def _add(to: Statistics, other: Statistics) -> None:

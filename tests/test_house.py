@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "errors": set(),
     "graph": {"errors"},
     "transitions": {"errors", "graph"},
-    "uct": {"errors", "transitions"},
+    "uct": {"errors", "graph", "transitions"},
     # the mathematics
     "poses": set(),
     "distance": set(),

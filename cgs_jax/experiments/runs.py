@@ -171,6 +171,9 @@ class Survey:
     def record(self, *arguments: Any, **named: Any) -> None:
         self.tree.record(*arguments, **named)
 
+    def tries(self, prefix: Path, transition: Transition) -> int:
+        return self.tree.tries(prefix, transition)
+
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
         return self.tree.best_sequences(k)
 
