@@ -12,14 +12,16 @@ What differs from plain UCT, and why:
   histories do not matter a lot, where the operator succeeds four times as often after one as after another very little.
 * A condition may be tried several times. Those that still wait for another try are censored observations: success is
   counted per try, and success within all tries follows by the product of Kaplan and Meier (1958).
+* What never ran is judged by its dof and rows (`guessed_success`), corrected by how the instance's operators that ran did
+  in comparison; how many tries of a condition pay follows from what it cost.
 * Visits are counted in batches. Q is normalised among siblings by what the best of them could gain, so that `c_uct`
   depends neither on the unit of time nor on how rare samples are.
 
 The reward is the paper's lambda * r_t + (1 - lambda) * r_g with lambda = 1/(c + 1), divided by (1 - lambda): success
 minus time * price, price = 1/c. With c the cost per *finished sample* this is Dinkelbach's rule, whose maximum is the
 most samples per second. The realised rate lags behind what was learned, and at too low a price of time what succeeds
-often seems better than what is quick: the price is the predicted rate of the best sequence once that has been run to
-the end (Dinkelbach's iteration on the model). With c the cost per rollout time is priced too dear and what fails fast
+often seems better than what is quick: the price is the best predicted rate of any sequence (Dinkelbach's fixed point on
+the model), on large graphs that of the sequence of greatest Q once it has been run to the end. With c the cost per rollout time is priced too dear and what fails fast
 is preferred.
 """
 
@@ -727,7 +729,7 @@ class Tree(_Records):
     """UCT over sequences with a model-based backup.
 
     c_uct: weight of the exploration bonus, on values normalised among siblings. reward: "rate" (time costs the
-    discounted realised rate, or the predicted rate of the sequence of greatest Q where that is more) or "rollout" (time
+    discounted realised rate, or the best predicted rate where that is more) or "rollout" (time
     costs one over the mean seconds per rollout).
     equivalent_visits: an operator's visits after other histories count on an edge like up to so many visits of its own,
     so that not every child of every node is tried anew. retain: on failure the components which the failed transition
