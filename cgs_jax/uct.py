@@ -21,8 +21,8 @@ The reward is the paper's lambda * r_t + (1 - lambda) * r_g with lambda = 1/(c +
 minus time * price, price = 1/c. With c the cost per *finished sample* this is Dinkelbach's rule, whose maximum is the
 most samples per second. The realised rate lags behind what was learned, and at too low a price of time what succeeds
 often seems better than what is quick: the price is the best predicted rate of any sequence (Dinkelbach's fixed point on
-the model), on large graphs that of the sequence of greatest Q once it has been run to the end. With c the cost per rollout time is priced too dear and what fails fast
-is preferred.
+the model), on large graphs that of the sequence of greatest Q once it has been run to the end. With c the cost per
+rollout time is priced too dear and what fails fast is preferred.
 """
 
 from __future__ import annotations
