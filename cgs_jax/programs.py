@@ -178,11 +178,13 @@ class Program:
     def portable(self) -> bytes | None:
         """The compiled program, to be loaded by another process on this machine (`load_portable`).
 
-        None where JAX keeps a cache of its own: what comes out of that cache cannot be serialised again.
+        None where JAX keeps a cache of its own, since what comes out of that cannot be serialised again, and where its entry
+        has gone from the cache since.
         """
         if self._portable is None and self._entry is not None:
-            self._portable = self._entry.read_bytes()
-        if self._portable is None and not _jax_caches():
+            with contextlib.suppress(OSError):
+                self._portable = self._entry.read_bytes()
+        elif self._portable is None and not _jax_caches():
             self._portable = pickle.dumps((self.name, serialize_executable.serialize(self._executable)))
         return self._portable
 

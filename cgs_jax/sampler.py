@@ -229,7 +229,7 @@ class _Pace:
     def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float, look: bool) -> float:
         """Device seconds to charge for a batch, whose measured time is taken into account unless it is a first look.
 
-        Looks run in the scheduling process, beside the workers: three on two cores.
+        Looks may run in the scheduling process, beside workers that start.
         """
         program = operator.plan.layout
         if tasks >= REPRESENTATIVE and not look:

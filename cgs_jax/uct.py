@@ -57,7 +57,7 @@ HARDNESS_LOOPS = 3.0
 """Weight, in loops, of the belief that an instance is as hard as guessed."""
 
 CORRELATION = 0.03
-"""Guess of how much of the variance of success lies between the histories of an operator (`_Records._trust`)."""
+"""Guess of how much of the variance of success lies between the histories of an operator (`_Records._correlation`)."""
 
 CORRELATION_TRIES = 1000.0
 """Weight of that guess, in tries."""
@@ -75,8 +75,8 @@ ENUMERABLE = 3000
 """Up to this many transitions the values below the tree come from dynamic programming over all states."""
 
 UNTRIED_VISITS = 1.0
-"""What was never tried counts as visited this often, instead of never, while the share below is used up or where there
-are more transitions than could be tried first. Its bonus still grows without bound."""
+"""What was never tried counts as visited this often, instead of never: it is tried when it promises something, not first.
+Its bonus still grows without bound."""
 
 HOPE = 0.5
 """In the search success is taken for its mean plus this many standard deviations, by what is known of the history."""

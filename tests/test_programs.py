@@ -62,6 +62,20 @@ def test_a_damaged_entry_of_the_cache_is_replaced(folder):
     np.testing.assert_array_equal(BatchRunner(at, 0, SMALL).run(batch).values["t"], wanted.values["t"])
 
 
+def test_an_entry_that_goes_before_it_is_read_is_compiled(folder):
+    """Another process may have made room in the cache."""
+    at, batch = grasps()
+    wanted = BatchRunner(at, 0, SMALL).run(batch)
+    programs._compiled.clear()
+    runner = BatchRunner(at, 0, SMALL)
+    (future,) = runner.request(operator_of(at, batch.transition))
+    program = future.result()
+    (entry,) = folder.glob("*.program")
+    entry.unlink()
+    assert program.portable is None
+    np.testing.assert_array_equal(runner.run(batch).values["t"], wanted.values["t"])
+
+
 def test_a_received_program_that_fails_is_compiled_once(folder):
     at, batch = grasps()
     runner = BatchRunner(at, 0, SMALL)
