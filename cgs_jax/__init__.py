@@ -21,7 +21,7 @@ _HOMES = {
     "Tolerances": "audit",
     "available_scenes": "scene",
     "check_problem": "check",
-    "enable_disk_cache": "programs",
+    "enable_disk_cache": "cache",
     "end_process": "programs",
     "load_problem": "problems",
     "load_tree": "api",

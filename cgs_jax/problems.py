@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -452,7 +454,15 @@ class _Builder:
             return not np.any(counted[contact.geom].all(axis=1) & (contact.dist < 0))
 
         chains = {key: chain for key, chain in self.chains.items() if key.split("/")[0] == robot.name}
-        return Pool(*self.limits(robot), chains, is_free)
+        key = pickle.dumps((self._model_digest, reader.qpos_addresses, counted, self.scene.home_qpos))
+        return Pool(*self.limits(robot), chains, is_free, key)
+
+    @functools.cached_property
+    def _model_digest(self) -> str:
+        """Of all numbers of the model, and of the MuJoCo that reads them."""
+        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, buffer)
+        return hashlib.sha256(mujoco.__version__.encode() + buffer.tobytes()).hexdigest()
 
 
 def _body_variables(body: Body) -> set[str]:

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import itertools
 import os
 import pickle
 import platform
-import re
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,65 +23,19 @@ import jax
 import jaxlib
 from jax.experimental import serialize_executable
 
-CACHE_BYTES = 512 * 2**20
-"""Size to which the cache on disk is kept; the programs used longest ago go first."""
+from cgs_jax import cache
 
 _numbers = itertools.count()
 _lock = threading.Lock()
 _compiled: dict[Any, Future] = {}
 _pool: ThreadPoolExecutor | None = None
-_folder: Path | None = None
-_writing = threading.Lock()
-
-
-def enable_disk_cache(folder: str | os.PathLike[str] | None = None) -> Path:
-    """Keeps compiled programs in a folder, by default `cgs_jax` under `XDG_CACHE_HOME` (default `~/.cache`).
-
-    Entries are whole executables: what is found is neither traced nor compiled. (JAX's own cache still traces, and what comes
-    out of it cannot be handed to another process.) An entry is written under another name and renamed, so that several
-    processes may share the folder. Returns the folder.
-    """
-    global _folder
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    _folder = Path(folder) if folder is not None else Path(base) / "cgs_jax"
-    return _folder
 
 
 def end_process(status: int) -> NoReturn:
     """Ends the process at once, where a normal exit would wait for every program that is still to be compiled."""
-    _writing.acquire(timeout=10)
+    cache.finish_writing(timeout=10)
     os._exit(status)
 
-
-def _digest(paths: Iterable[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-IMPORT = re.compile(r"^\s*from cgs_jax(?:\.(\w+))? import (.*)$", flags=re.M)
-
-
-def imported_by(module: str) -> set[Path]:
-    """Files of this package that a module of it is made of: its own, and those that it imports, directly or not."""
-    found: set[Path] = set()
-    wanted = {module}
-    while wanted:
-        path = Path(__file__).parent / f"{wanted.pop()}.py"
-        if path in found or not path.exists():
-            continue
-        found.add(path)
-        for name, names in IMPORT.findall(path.read_text(encoding="utf-8")):
-            wanted.update([name] if name else map(str.strip, names.split(",")))
-    return found
-
-
-SOURCES = _digest(Path(__file__).parent.glob("*.py"))
-"""Digest of this package's text as it was when this process imported it."""
-
-DEVICE_SOURCES = _digest(imported_by("operators"))
-"""Digest of what device programs are made from."""
 
 VARIABLES = ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS")
 """Variables of the environment that change what XLA generates."""
@@ -109,7 +61,8 @@ def _machine() -> str:
 
 def _environment() -> str:
     """What a compiled program depends on besides its key: the text it is made from, jax and its settings, and the machine."""
-    parts = [DEVICE_SOURCES, _machine(), jax.__version__, jaxlib.__version__, jax.default_backend(), platform.python_version()]
+    versions = [jax.__version__, jaxlib.__version__, jax.default_backend(), platform.python_version()]
+    parts = [cache.DEVICE_SOURCES, _machine(), *versions]
     parts += [f"{name}={os.environ.get(name)}" for name in VARIABLES]
     parts += [f"{name}={jax.config.values.get(name)}" for name in OPTIONS]
     return "\n".join(parts)
@@ -120,26 +73,14 @@ def _jax_caches() -> bool:
 
 
 def _entry(key: str | None, shapes: tuple) -> Path | None:
-    """File of a program in the cache; None where it is not to be cached."""
-    if key is None or _folder is None or _jax_caches():
+    """File of a program in the cache; None where it is not to be cached.
+
+    Entries are whole executables: what is found is neither traced nor compiled. (JAX's own cache still traces, and what comes
+    out of it cannot be handed to another process.)
+    """
+    if key is None or _jax_caches():
         return None
-    text = f"{_environment()} {key} {_signature(shapes)}"
-    return _folder / f"{hashlib.sha256(text.encode()).hexdigest()}.program"
-
-
-def _store(path: Path, data: bytes) -> None:
-    with _writing, contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}.part")
-        part.write_bytes(data)
-        part.replace(path)
-        entries = [(entry.stat().st_mtime, entry.stat().st_size, entry) for entry in path.parent.glob("*.program")]
-        excess = sum(size for _, size, _ in entries) - CACHE_BYTES
-        for _, size, entry in sorted(entries):
-            if excess <= 0:
-                break
-            entry.unlink(missing_ok=True)
-            excess -= size
+    return cache.entry(".program", _environment(), key, str(_signature(shapes)))
 
 
 class Program:
@@ -166,8 +107,6 @@ class Program:
         with self._loading:
             if self._executable is None:
                 self._executable = _deserialize(self.portable)[1]
-                with contextlib.suppress(OSError):
-                    os.utime(self._entry)
 
     def __call__(self, *arguments: Any) -> Any:
         """Runs it and waits for the result; releases the GIL meanwhile."""
@@ -183,7 +122,7 @@ class Program:
         """
         if self._portable is None and self._entry is not None:
             with contextlib.suppress(OSError):
-                self._portable = self._entry.read_bytes()
+                self._portable = cache.read(self._entry)
         elif self._portable is None and not _jax_caches():
             self._portable = pickle.dumps((self.name, serialize_executable.serialize(self._executable)))
         return self._portable
@@ -250,5 +189,5 @@ def _make(name: str, function: Any, shapes: tuple, key: str | None) -> Program:
     executable = function.lower(*shapes).compile()
     program = Program(name, executable, time.perf_counter() - start)
     if path is not None and program.portable is not None:
-        _store(path, program.portable)
+        cache.store(path, program.portable)
     return program

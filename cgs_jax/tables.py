@@ -3,11 +3,12 @@
 A `Pool` holds many random configurations of one robot. Its plain table is the first of them that collide with nothing that is
 always there. An operator gets a table of its own, *aimed* at what its rows ask: most entries are the pool's nearest to targets
 of the kind that the operator will see, since a projection that starts near its target arrives more often, in fewer steps, and
-is less likely to collide there. All of this is host work in numpy, once per operator.
+is less likely to collide there. All of this is host work in numpy, once per operator; the tables are kept in the cache on disk.
 """
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import threading
 import zlib
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cgs_jax import cache
 from cgs_jax.constraints import RowData, Term
 from cgs_jax.kinematics import Chain, tool_poses_on_host
 from cgs_jax.plans import Plan
@@ -70,13 +72,20 @@ class SeedTable(NamedTuple):
 class Pool:
     """Random configurations of one robot within its limits `(dof,)`, made when they are first asked for.
 
-    is_free tells whether a configuration `(dof,)` collides with nothing that is always there.
+    is_free tells whether a configuration `(dof,)` collides with nothing that is always there. key: what that depends on; pools
+    with the same limits, chains and key share tables in the cache on disk.
     """
 
     def __init__(
-        self, low: np.ndarray, high: np.ndarray, chains: Mapping[str, Chain], is_free: Callable[[np.ndarray], bool]
+        self,
+        low: np.ndarray,
+        high: np.ndarray,
+        chains: Mapping[str, Chain],
+        is_free: Callable[[np.ndarray], bool],
+        key: bytes,
     ) -> None:
         self._low, self._high, self._chains, self._is_free = low, high, dict(chains), is_free
+        self._key = pickle.dumps((low, high, self._chains, key))
         self._free: dict[int, bool] = {}
         self._lock = threading.RLock()  # batches of several threads ask
         self._aimed: dict[bytes, SeedTable] = {}
@@ -117,23 +126,31 @@ class Pool:
         }
         return SeedTable(q.T.astype(np.float32), tools)
 
-    @property
+    @cached_property
     def plain(self) -> SeedTable:
         """Entries from the whole space."""
-        with self._lock:
-            return self._plain_table
-
-    @cached_property
-    def _plain_table(self) -> SeedTable:
-        return self._table(self._plain)
+        return self._kept((), lambda: self._plain)
 
     def aimed(self, words: Sequence[Word]) -> SeedTable:
         """Most entries are near one of the targets of `words` or another; words have one target each or equally many."""
         key = pickle.dumps(list(words))
         with self._lock:
             if key not in self._aimed:
-                self._aimed[key] = self._table(self._near(words))
+                self._aimed[key] = self._kept(words, lambda: self._near(words))
             return self._aimed[key]
+
+    def _kept(self, words: Sequence[Word], make: Callable[[], np.ndarray]) -> SeedTable:
+        """The table from the cache, or made and left there."""
+        entry = cache.entry(".table", cache.DEVICE_SOURCES, np.__version__, self._key, pickle.dumps(list(words)))
+        if entry is not None:
+            # Whatever is wrong with an entry, it can be made again.
+            with contextlib.suppress(Exception):
+                return SeedTable(*pickle.loads(cache.read(entry)))
+        with self._lock:
+            table = self._table(make())
+        if entry is not None:
+            cache.store(entry, pickle.dumps(tuple(table)))
+        return table
 
     def _near(self, words: Sequence[Word]) -> np.ndarray:
         rng = np.random.default_rng(0)

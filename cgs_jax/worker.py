@@ -16,14 +16,16 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
 
+from cgs_jax import cache
 from cgs_jax.audit import Tolerances
 from cgs_jax.batches import AimedTables, Batch, BatchRunner, BatchSettings, Outcome
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
 from cgs_jax.problems import load_problem
-from cgs_jax.programs import SOURCES, Program, load_portable
+from cgs_jax.programs import Program, load_portable
 from cgs_jax.transitions import Transition
 
 ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -39,6 +41,8 @@ class Setup:
     seed: int
     settings: BatchSettings
     tolerances: Tolerances | None
+    cache_folder: Path | None
+    """Where it keeps the seed tables that it makes (`cache`)."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Worker:
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
-        self._send(SOURCES)
+        self._send(cache.SOURCES)
         self._failed = False
         self._installed: set[int] = set()
         self._sent: set[int] = set()
@@ -95,6 +99,10 @@ class Worker:
         missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
         self._sent.update(missing)
         self._send(Install(identity, numbers, missing, aimed))
+
+    def has(self, program: Program) -> bool:
+        """Whether a program was sent to it."""
+        return program.number in self._sent
 
     def await_ready(self) -> bool:
         """Waits until it can take batches; False when it ended before. Raises InputError when it runs other sources,
@@ -180,7 +188,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         sink.flush()
 
     # Plain text comes first: messages of other sources may have other fields.
-    if pickle.load(source) != SOURCES:
+    if pickle.load(source) != cache.SOURCES:
         answer(
             InputError(
                 "a worker process found other sources of cgs_jax than this process had loaded, expected the same: "
@@ -196,6 +204,8 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             return
         try:
             if isinstance(message, Setup):
+                if message.cache_folder is not None:
+                    cache.enable_disk_cache(message.cache_folder)
                 problem = load_problem(message.scene, message.instance)
                 runner = BatchRunner(problem, message.seed, message.settings, message.tolerances)
                 answer("ready")

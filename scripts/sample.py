@@ -125,7 +125,7 @@ def parser() -> Parser:
     output.add_argument("--report", action="store_true", help="write report.html, one page that needs no network")
     output.add_argument("--render", action="store_true", help="write a contact sheet and a GIF of diverse samples")
     output.add_argument("--view", action="store_true", help="show the samples in a web page at the end")
-    output.add_argument("--no-cache", action="store_true", help="keep no compiled programs on disk")
+    output.add_argument("--no-cache", action="store_true", help="keep no compiled programs and seed tables on disk")
     return parse
 
 

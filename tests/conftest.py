@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from cgs_jax.programs import enable_disk_cache
+from cgs_jax.cache import enable_disk_cache
 
 ROOT = Path(__file__).parents[1]
 

@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "collisions": {"constraints", "distance", "kinematics", "poses"},
     "plans": {"augmented_lagrangian", "collisions", "constraints", "distance", "kinematics", "poses"},
     "seeds": {"constraints", "plans", "poses"},
-    "tables": {"constraints", "kinematics", "plans", "poses", "seeds"},
+    "tables": {"cache", "constraints", "kinematics", "plans", "poses", "seeds"},
     "costs": {"augmented_lagrangian", "plans", "poses"},
     # scenes, samples and what reads them
     "scene": {"errors"},
@@ -49,7 +49,8 @@ MAY_IMPORT = {
     "fitting": {"errors"},
     "starter": {"errors", "fitting", "render"},
     # the bridge
-    "programs": set(),
+    "cache": set(),
+    "programs": {"cache"},
     "problems": {"errors", "graph", "transitions", "scene"} | MATHEMATICS,
     "operators": {"errors", "problems", "transitions"} | MATHEMATICS,
     "keyframes": {"constraints", "kinematics", "problems"},
@@ -58,10 +59,10 @@ MAY_IMPORT = {
         "audit", "augmented_lagrangian", "keyframes", "operators", "own", "problems", "programs", "scene", "tables",
         "transitions",
     },
-    "worker": {"errors", "audit", "batches", "operators", "problems", "programs", "transitions"},
+    "worker": {"errors", "audit", "batches", "cache", "operators", "problems", "programs", "transitions"},
     "sampler": {
-        "errors", "audit", "augmented_lagrangian", "batches", "keyframes", "operators", "problems", "programs", "scene",
-        "transitions", "uct", "worker",
+        "errors", "audit", "augmented_lagrangian", "batches", "cache", "keyframes", "operators", "problems", "programs",
+        "scene", "transitions", "uct", "worker",
     },
     # the porch
     "diagram": {"errors", "graph", "scene"},

@@ -11,7 +11,7 @@ import pytest
 from loaded import problem
 
 import cgs_jax
-from cgs_jax import programs, worker
+from cgs_jax import cache, programs, worker
 from cgs_jax.api import conditional
 from cgs_jax.batches import Batch, BatchRunner, BatchSettings
 from cgs_jax.errors import InputError
@@ -24,7 +24,7 @@ SMALL = BatchSettings(64, 32, SETTINGS.solver)
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(programs, "_folder", tmp_path)
+    monkeypatch.setattr(cache, "_folder", tmp_path)
     monkeypatch.setattr(programs, "_compiled", {})
     return tmp_path
 
@@ -115,7 +115,7 @@ def test_what_changes_the_generated_code_belongs_to_the_key(folder, monkeypatch,
 
 def test_programs_are_kept_while_what_they_are_made_from_is_the_same():
     """The search and the files can change without a new compilation; the solver, or what it imports, cannot."""
-    names = {path.stem for path in programs.imported_by("operators")}
+    names = {path.stem for path in cache.imported_by("operators")}
     loaded = "import sys, cgs_jax.operators; print(*(m[8:] for m in sys.modules if m.startswith('cgs_jax.')))"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     # The package itself imports its parts only when they are asked for.
@@ -146,23 +146,23 @@ def test_a_worker_with_other_sources_refuses_in_one_line():
 def test_a_refusal_ends_the_run(monkeypatch):
     at = cgs_jax.load_problem("pick_place")
     monkeypatch.setattr(worker, "_idle", [])
-    monkeypatch.setattr(worker, "SOURCES", "another digest")
+    monkeypatch.setattr(cache, "SOURCES", "another digest")
     with pytest.raises(InputError, match="other sources"):
         cgs_jax.sample(at, time_budget=30.0, method="expert3")
 
 
 def test_a_worker_compiles_what_it_cannot_load():
     at, batch = grasps()
-    setup = worker.Setup(*at.source, 0, SMALL, None)
+    setup = worker.Setup(*at.source, 0, SMALL, None, None)
     number = operator_of(at, batch.transition).identity
-    answers = told(programs.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}, []), batch)
+    answers = told(cache.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}, []), batch)
     assert answers[0] == "ready" and len(answers) == 2 and answers[1].success.all()
 
 
 def test_a_worker_serves_one_run_after_another():
     at, batch = grasps()
-    first, second = (worker.Setup(at.source[0], instance, 0, SMALL, None) for instance in (at.source[1], 3))
-    answers = told(programs.SOURCES, first, batch, second, batch)
+    first, second = (worker.Setup(at.source[0], instance, 0, SMALL, None, None) for instance in (at.source[1], 3))
+    answers = told(cache.SOURCES, first, batch, second, batch)
     assert answers[0] == answers[2] == "ready" and len(answers) == 4
     assert answers[1].success.all() and answers[3].success.all()
 
@@ -183,7 +183,7 @@ def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
 def test_a_worker_that_failed_is_not_kept(monkeypatch):
     monkeypatch.setattr(worker, "_idle", [])
     at, batch = grasps()
-    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None))
+    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None, None))
     assert one.await_ready()
     with pytest.raises(Exception, match="object"):
         one.run("no batch")

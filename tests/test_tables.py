@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cgs_jax import tables
+from cgs_jax import cache, tables
 from cgs_jax.constraints import row_data
 from cgs_jax.operators import aimed_at, operator_of
 from cgs_jax.problems import load_problem
@@ -150,7 +150,40 @@ def test_drawn_targets_satisfy_the_grasp(at):
 
 def test_a_robot_that_always_collides_still_has_a_table(at):
     pool = at.pools["a"]
-    stuck = tables.Pool(pool._low, pool._high, pool._chains, lambda q: False)
+    stuck = tables.Pool(pool._low, pool._high, pool._chains, lambda q: False, b"stuck")
     made = operator(at, "(q_a1,t_a)")
     table = aimed_at(dataclasses.replace(at, pools={**at.pools, "a": stuck}), made)[0]
     assert table.configurations.shape == (7, TABLE_SIZE) and NEAREST < TABLE_SIZE
+
+
+def test_tables_are_read_from_the_cache_and_made_again_when_damaged(at, monkeypatch, tmp_path):
+    monkeypatch.setattr(cache, "_folder", tmp_path)
+    pool = at.pools["a"]
+
+    def fresh():
+        return tables.Pool(pool._low, pool._high, pool._chains, pool._is_free, b"free")
+
+    def unused(self, q):
+        raise AssertionError("made instead of read")
+
+    made = fresh().plain
+    (entry,) = tmp_path.glob("*.table")
+    with monkeypatch.context() as patch:
+        patch.setattr(tables.Pool, "_table", unused)
+        read = fresh().plain
+    other = tables.Pool(pool._low, pool._high, pool._chains, lambda q: False, b"stuck").plain
+    entry.write_bytes(entry.read_bytes()[:-100])
+    again = fresh().plain
+    for table in (read, again):
+        np.testing.assert_array_equal(table.configurations, made.configurations)
+        for name, pose in table.tools.items():
+            np.testing.assert_array_equal(pose.rotation, made.tools[name].rotation)
+            np.testing.assert_array_equal(pose.position, made.tools[name].position)
+    assert not np.array_equal(other.configurations, made.configurations)
+
+
+def test_tables_of_instances_do_not_meet_in_the_cache(at):
+    """Their objects stand elsewhere."""
+    keys = {load_problem("handover", instance).pools["a"]._key for instance in range(3)}
+    assert len(keys) == 3 and at.pools["a"]._key in keys
+    assert load_problem("handover", 0).pools["a"]._key == at.pools["a"]._key
