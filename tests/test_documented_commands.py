@@ -1,6 +1,9 @@
 """Every shell and Python block of the pages runs, in a folder of its own, with short budgets."""
 
+import functools
 import importlib.util
+import json
+import logging
 import re
 import shlex
 import shutil
@@ -8,10 +11,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import made_up
 import pytest
 
-from cgs_jax import render
+from cgs_jax import cache, render
 from cgs_jax.errors import InputError
+from cgs_jax.experiments import study
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,11 +35,11 @@ SHORTENED = {
     "scripts/verify.py": [],
 }
 
-# Commands of which only the arguments are read, by which function, and why.
-ONLY_PARSED = {
-    "scripts/benchmark.py": ("parse", "measures for minutes; test_benchmark.py runs its parts"),
-    "scripts/reproduce.py": ("parser", "runs for hours; test_reproduce.py runs a small study"),
-}
+# Appended to a study; last ones count.
+MADE_UP_STUDY = ["--seconds", "1", "--seeds", "1", "--instances", "2"]
+
+# Words of commands in the running text that stand for others.
+STANDS_FOR = {"NAME": "pick_place"}
 
 # Commands that are not run, and why.
 NOT_RUN = {
@@ -77,6 +82,12 @@ def commands(path):
             yield words
 
 
+def commands_in_the_text(path):
+    """Commands between single backquotes."""
+    for text in re.findall(r"`(python\s+scripts/[^`]+)`", path.read_text(encoding="utf-8")):
+        yield [STANDS_FOR.get(word, word) for word in shlex.split(text)]
+
+
 def load_script(path):
     spec = importlib.util.spec_from_file_location(f"documented_{Path(path).stem}", ROOT / path)
     module = importlib.util.module_from_spec(spec)
@@ -111,8 +122,12 @@ def test_pictures_are_small():
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
     """A folder from which the commands find what they name."""
-    for name in ("scripts", "scenes", "docs"):
+    for name in ("scripts", "scenes"):
         (tmp_path / name).symlink_to(ROOT / name)
+    # A copy: some commands write there.
+    shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    for name in ("old.json", "new.json"):
+        shutil.copy(ROOT / "docs" / "results" / "throughput.json", tmp_path / name)
     # The task file of the user's own that scenes/README.md speaks of.
     shutil.copytree(ROOT / "scenes" / "pick_place", tmp_path / "my_scene")
     (tmp_path / "my_scene" / "pick_place.toml").rename(tmp_path / "my_scene" / "my_scene.toml")
@@ -126,15 +141,43 @@ def start(*arguments):
     assert done.returncode == 0, (arguments, done.stdout + done.stderr)
 
 
-def run(words):
+# Commands that measure for minutes or hours are run up to the measurement and from it on: figures that are committed or made
+# up stand in for what was measured. test_benchmark.py and test_reproduce.py measure.
+
+
+def benchmark(arguments, monkeypatch):
+    """`scripts/benchmark.py` with the committed figures for those of its parts that are run."""
+    module = load_script("scripts/benchmark.py")
+    committed = {}
+    for path in sorted((ROOT / "docs" / "results").glob("*.json")):
+        committed |= json.loads(path.read_text(encoding="utf-8"))["parts"]
+    parts = {name: (lambda given, name=name: dict(committed[name]), tables) for name, (_, tables) in module.PARTS.items()}
+    monkeypatch.setattr(module, "PARTS", parts)
+    return module.main(arguments)
+
+
+def reproduce(arguments, monkeypatch):
+    """`scripts/reproduce.py` with made-up runs."""
+    monkeypatch.setattr(study, "execute", functools.partial(made_up.run, scale=0.2))
+    monkeypatch.setattr(study, "prepare", lambda problem, settings: iter(()))
+    return load_script("scripts/reproduce.py").main([*arguments, *MADE_UP_STUDY])
+
+
+REHEARSED = {"scripts/benchmark.py": benchmark, "scripts/reproduce.py": reproduce}
+
+
+def run(words, monkeypatch):
     program = words[0]
     if program in NOT_RUN:
         return
     assert program == "python", f"{words}: nothing is said here of {program}"
     script, arguments = words[1], [str(Path(word).expanduser()) for word in words[2:]]
-    if script in ONLY_PARSED:
-        module = load_script(script)
-        getattr(module, ONLY_PARSED[script][0])().parse_args(arguments)
+    if script in REHEARSED:
+        # What a command sets for its process is put back.
+        with monkeypatch.context() as patch:
+            patch.setattr(cache, "_folder", cache.cache_folder())
+            patch.setattr(logging.root.manager, "disable", logging.root.manager.disable)
+            assert REHEARSED[script](arguments, patch) == 0, words
         return
     if script == "scripts/show.py" or "--render" in arguments:
         try:
@@ -145,9 +188,16 @@ def run(words):
 
 
 @pytest.mark.parametrize("path", [path for path in PAGES if blocks(path, "sh")], ids=lambda path: str(path.relative_to(ROOT)))
-def test_commands_of_a_page_run(path, elsewhere):
+def test_commands_of_a_page_run(path, elsewhere, monkeypatch):
     for words in commands(path):
-        run(words)
+        run(words, monkeypatch)
+
+
+def test_commands_in_the_text_run(elsewhere, monkeypatch):
+    found = {tuple(words): None for path in PAGES for words in commands_in_the_text(path)}
+    assert found
+    for words in found:
+        run(list(words), monkeypatch)
 
 
 @pytest.mark.parametrize("path", [path for path in PAGES if blocks(path, "python")], ids=lambda path: path.name)

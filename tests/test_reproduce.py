@@ -4,11 +4,12 @@ import json
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
+import made_up
 import numpy as np
 import pytest
+from made_up import PAPER
 from paper_graphs import handover
 
 from cgs_jax.errors import InputError
@@ -17,7 +18,6 @@ from cgs_jax.transitions import Transitions
 from cgs_jax.uct import Tree
 
 ROOT = Path(__file__).parents[1]
-PAPER = tomllib.loads((ROOT / "scripts" / "reproduce.toml").read_text())["scenes"]
 
 
 # ------------------------------------------------------------------ measures
@@ -128,48 +128,11 @@ def test_operation_is_named_as_in_the_record():
 
 # ------------------------------------------------------------------ a whole study with made-up runs
 
-RATES = {"tree": 400.0, "tree-warm": 420.0, "expert1": 40.0, "expert2": 100.0, "expert3": 300.0, "rand": 20.0}
 BUDGET = Budget(
     seconds=2.0, seeds=2, instances=2, coverage_least=20, sweep_instances=1, sweep_seeds=1, prices=(0.1, 1.0),
     exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, screened=3, screen_seconds=0.5,
     top=2, top_seeds=1, operation_seconds=0.5,
 )  # fmt: skip
-
-
-def made_up(problem, chooser, run, settings=None, keep_values=False, keep_tree=False):
-    """A run that finds samples steadily, at the rate of its method and instance."""
-    random = np.random.default_rng([run.seed, run.instance, len(run.method)])
-    rate = RATES.get(run.method, 200.0) * (1.0 + run.instance)
-    elapsed = np.arange(1, int(rate * run.seconds) + 1) / rate
-    path = next(problem.transitions.sequences())
-    text = problem.transitions.format(path)
-    tree = Tree(problem.transitions)
-    for sequence in runs.covering_sequences(problem.transitions):
-        for position, transition in enumerate(sequence):
-            tree.record(sequence[:position], transition, 100, 50, 0.01 * len(transition.new))
-    operators, tries = {}, {}
-    for entry in PAPER["handover"]["operations"]:
-        if entry["sequence"] == run.method:
-            name = runs.operation_name(problem.transitions, entry["sequence"], entry["new"])
-            operators[name] = {"microseconds_per_task": 3.0 * len(entry["new"]), "device_seconds": 1.0}
-            tries[name] = [1000, 1000 - 100 * len(entry["new"])]
-    data = {
-        "meta": {"startup_seconds": 0.4, "compile_seconds": 7.0, "rejected_by_audit": 0},
-        "max_violation": 3e-5,
-        "sequences": {text: len(elapsed)},
-        "best_sequences": [[text, rate]],
-        "operators": operators,
-        "first_tries": tries,
-    }
-    if keep_tree:
-        data["tree"] = tree.as_json()
-    values = {}
-    for variable in problem.graph.variables if keep_values else ():
-        value = random.uniform(-1.0, 1.0, (len(elapsed), 7)).astype(np.float32)
-        if variable.kind == "pose":
-            value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
-        values[variable.name] = value
-    return runs.Kept(data, elapsed, values)
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +142,7 @@ def finished(tmp_path_factory):
 
     def record(problem, chooser, run, *arguments, **named):
         made.append(run)
-        return made_up(problem, chooser, run, *arguments, **named)
+        return made_up.run(problem, chooser, run, *arguments, **named)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "execute", record)
