@@ -81,6 +81,8 @@ class Outcome:
     """Tasks stopped by each constraint; a task that violates several rows counts for the worst."""
     device_seconds: float
     host_seconds: float
+    load_seconds: float
+    """Until its programs were there."""
     audited: Audited | None
 
 
@@ -115,6 +117,7 @@ class BatchRunner:
         self._seed = seed
         self._numbers: dict[Any, Any] = {}
         self._requested: dict[int, list[Future]] = {}
+        self._distinct: dict[int, Future] = {}  # operators share programs
         self._aimed: dict[int, AimedTables] = self.problem.aimed
         self._lock = threading.Lock()
 
@@ -124,7 +127,8 @@ class BatchRunner:
         """Programs of an operator: `propose`, then the clearances in order. Compiled in the background on first request."""
         with self._lock:
             if operator.identity not in self._requested:
-                self._requested[operator.identity] = self._programs(operator)
+                self._requested[operator.identity] = futures = self._programs(operator)
+                self._distinct |= {id(future): future for future in futures}
             return self._requested[operator.identity]
 
     def is_aimed(self, operator: Operator) -> bool:
@@ -149,6 +153,7 @@ class BatchRunner:
             futures[-1].set_result(program)
         with self._lock:
             self._requested[identity] = futures
+            self._distinct |= {id(future): future for future in futures}
 
     def ready(self, operator: Operator) -> bool:
         """Whether all programs of an operator have been requested and are there: compiled, or in the cache on disk."""
@@ -156,8 +161,8 @@ class BatchRunner:
         return futures is not None and all(future.done() for future in futures)
 
     def requested(self) -> list[Future]:
-        """All programs requested so far."""
-        return [future for futures in self._requested.values() for future in futures]
+        """All programs requested so far, each once."""
+        return list(self._distinct.values())
 
     def _programs(self, operator: Operator) -> list[Future]:
         return [programs.request(*recipe) for recipe in self._recipes(operator)]
@@ -186,6 +191,7 @@ class BatchRunner:
         with self._lock:
             self._requested[operator.identity] = list(self._requested[operator.identity])
             self._requested[operator.identity][position] = replaced
+            self._distinct[id(replaced)] = replaced
         return replaced.result()
 
     def _recipes(self, operator: Operator) -> list[tuple]:
@@ -231,6 +237,7 @@ class BatchRunner:
     def run(self, batch: Batch) -> Outcome:
         """Runs one batch and, where it completes samples, audits them. Waits for its programs."""
         operator, problem = operator_of(self.problem, batch.transition), self.problem
+        asked = time.perf_counter()
         self.load(operator)
         began = time.perf_counter()
         count, room = batch.tasks, self.settings.batch_size
@@ -286,7 +293,7 @@ class BatchRunner:
         host = max(time.perf_counter() - began - device - audit_seconds, 0.0)
         if self.settings.counted_time:
             device = WORK_SECONDS * (count + iterations) * (1 + operator.plan.layout.unknowns)
-        return Outcome(values, mask, proposed, iterations, failures, device, host, audited)
+        return Outcome(values, mask, proposed, iterations, failures, device, host, began - asked, audited)
 
     def audit(self, values: Values) -> Audited:
         """Keyframes and audit of full samples."""

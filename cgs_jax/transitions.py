@@ -47,13 +47,26 @@ class Transition:
     constraints: tuple[str, ...]
     condition: State
 
-    @property
+    # They are asked for, as keys too, many times in every choice: what follows from the fields is kept.
+
+    @cached_property
     def problem(self) -> Problem:
         return self.new, self.constraints
 
-    @property
+    @cached_property
     def target(self) -> State:
         return self.given.union(self.new)
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.given, self.new, self.constraints, self.condition))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __reduce__(self) -> tuple:
+        # Hashes of strings differ between processes.
+        return Transition, (self.given, self.new, self.constraints, self.condition)
 
     def __str__(self) -> str:
         return self.new[0] if len(self.new) == 1 else f"({','.join(self.new)})"
