@@ -27,6 +27,7 @@ import numpy as np
 from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
+from cgs_jax.cache import cache_folder
 from cgs_jax.operators import Operator, operator_of
 from cgs_jax.problems import Collisions, Problem, with_collisions
 from cgs_jax.transitions import Transition
@@ -135,8 +136,8 @@ class Pool:
         return {name: np.concatenate([chunk[name] for chunk in taken]) for name in taken[0]}
 
 
-History = tuple
-"""A component's history: (operator's problem, histories of the components it read)."""
+History = int
+"""Number of a component's history: an operator's problem and the histories of the components it read."""
 
 
 @dataclass(frozen=True)
@@ -267,8 +268,8 @@ class _Crew:
     """Who runs batches: worker processes where the problem can be loaded there, and this process until they have arrived."""
 
     def __init__(self, runner: BatchRunner, workers: int, setup: Setup | None) -> None:
-        self._free: queue.SimpleQueue[BatchRunner | Worker] = queue.SimpleQueue()
-        self._lock = threading.Lock()
+        self._free: list[BatchRunner | Worker] = []
+        self._changed = threading.Condition()
         self._wanted = workers
         self._arrived: list[Worker] = []
         self._local = runner
@@ -285,9 +286,29 @@ class _Crew:
             self._hire(setup)
 
     def _seat(self, member: BatchRunner | Worker) -> None:
-        with self._lock:
-            self._free.put(member)
+        with self._changed:
             self.size = min(self.size + 1, self._wanted)
+        self._release(member)
+
+    def _take(self, operator: Operator | None = None) -> BatchRunner | Worker:
+        """Whoever is free next; if some worker has the programs of an operator, one of those."""
+        with self._changed:
+            while True:
+                able = [member for member in self._arrived if operator is not None and self._has(member, operator)]
+                for member in self._free:
+                    if not able or member in able:
+                        self._free.remove(member)
+                        return member
+                self._changed.wait()
+
+    def _release(self, member: BatchRunner | Worker) -> None:
+        with self._changed:
+            self._free.append(member)
+            self._changed.notify_all()
+
+    def _has(self, worker: Worker, operator: Operator) -> bool:
+        futures = self._local.request(operator)
+        return all(future.done() and worker.has(future.result()) for future in futures)
 
     def _hire(self, setup: Setup) -> None:
         worker = hire(setup)
@@ -311,16 +332,17 @@ class _Crew:
         complete = self._workers and len(self._arrived) == self._wanted
         if look and not complete:
             if not self._local.is_aimed(operator):
-                member = self._free.get()
+                member = self._take()
                 try:
                     self._aim(member, operator, batch.transition)
                 finally:
-                    self._free.put(member)
+                    self._release(member)
             return self._local.run(batch)
-        member = self._free.get()
+        # To read a program takes longer than to look: not more than one worker does it for that.
+        member = self._take(operator if look else None)
         # With all workers there, this process has its core for compiling and deciding.
         if member is self._local and complete:
-            member = self._free.get()
+            member = self._take(operator if look else None)
         try:
             if isinstance(member, Worker):
                 self._aim(member, operator, batch.transition)
@@ -328,7 +350,7 @@ class _Crew:
                 member.install(operator.identity, ready, self._local.aimed(operator))
             return member.run(batch)
         finally:
-            self._free.put(member)
+            self._release(member)
 
     def _aim(self, member: BatchRunner | Worker, operator: Operator, transition: Transition) -> None:
         """Sees to it that the operator's seed tables are made; once, since whoever runs a batch gets them from here."""
@@ -362,6 +384,7 @@ class Sampler:
         self._seed, self._tolerances = seed, tolerances
         self._runner = BatchRunner(self.problem, seed, self._batch_settings, tolerances)
         self.auditor = self._runner.auditor
+        self._histories: dict[tuple, History] = {}
         self._pools: dict[History, Pool] = {}
         self._waiting: dict[History, Pool] = {}
         self._tasks: dict[int, int] = {}
@@ -374,6 +397,7 @@ class Sampler:
         self._looked_at: set[History] = set()  # now, in a first batch
         self._patience = 0
         self._announced: set[int] = set()
+        self._waited_for: list[Operator] = []  # whose programs are not all there yet
         self._full = problem.transitions.full
         self._stop = threading.Event()
 
@@ -385,6 +409,12 @@ class Sampler:
 
     def _ready(self, transition: Transition) -> bool:
         return self._runner.ready(operator_of(self.problem, transition))
+
+    def _all_ready(self) -> bool:
+        """Whether everything that may be chosen can run: soon nothing has to be asked any more."""
+        while self._waited_for and self._runner.ready(self._waited_for[-1]):
+            self._waited_for.pop()
+        return not self._waited_for
 
     def compile_order(self) -> list[Transition]:
         """One transition per conditional problem: first those of the sequence that is cheapest to compile, then by size."""
@@ -410,9 +440,8 @@ class Sampler:
                     reads = tuple(dict.fromkeys(component[name] for name in sorted(transition.condition)))
                 else:
                     reads = tuple(dict.fromkeys(component.values()))
-                makes: History = (transition.problem, tuple(sorted(reads, key=repr)))
-                if not self.settings.pools:
-                    makes = (*makes, position)
+                came_about = transition.problem, tuple(sorted(reads)), position if not self.settings.pools else None
+                makes = self._histories.setdefault(came_about, len(self._histories))
                 names = [*transition.new, *(name for read in reads for name in members[read])]
                 members[makes] = names
                 component |= dict.fromkeys(names, makes)
@@ -460,7 +489,7 @@ class Sampler:
                     break
                 # What is decided must not depend on when the workers arrive.
                 # One more than run at once waits, so that no worker does.
-                most = self.settings.workers if self.settings.deterministic else crew.size + 1
+                most = self.settings.workers if self.settings.deterministic else crew.size + 2
                 while len(in_flight) < most:
                     job = self._next_job()
                     if job is None:
@@ -496,7 +525,7 @@ class Sampler:
         if source is None or workers == 1:
             return _Crew(self._runner, workers, None)
         scene, instance = source
-        setup = Setup(scene, instance, self._seed, self._batch_settings, self._tolerances)
+        setup = Setup(scene, instance, self._seed, self._batch_settings, self._tolerances, cache_folder())
         return _Crew(self._runner, workers, setup)
 
     def _initial_requests(self) -> list[Operator]:
@@ -513,6 +542,7 @@ class Sampler:
         if not path:
             for transition in order:
                 self._runner.request(operator_of(self.problem, transition))
+                self._waited_for.append(operator_of(self.problem, transition))
         return operators
 
     def _cheapest_path(self, order: list[Transition]) -> Path:
@@ -563,7 +593,7 @@ class Sampler:
                 for future in self._runner.request(step.operator):
                     future.result()
         else:
-            path = self.chooser.select(self._ready)
+            path = self.chooser.select(None if self._all_ready() else self._ready)
         self._pursued = path
         return path
 
@@ -603,7 +633,7 @@ class Sampler:
                     return None
                 if not visits:
                     self._looked_at.add(slot)
-                if not young:
+                if all(self._visits.get(step.makes, 0) > 1 for step in steps):
                     self._steady = path
                 self._made[step.operator.identity].add(slot)
                 if path is self._pursued:
@@ -693,6 +723,7 @@ class Sampler:
             attempts=attempts.tolist(),
             successes=successes.tolist(),
             seconds=seconds,
+            spent=outcome.device_seconds if self.settings.deterministic else _passed(outcome),
         )
         if audited is not None:
             yield self._found(audited, job.path, elapsed)
@@ -721,6 +752,10 @@ class Sampler:
             for pool in pools:
                 values |= pool.take(count)
             yield self._found(self._runner.audit(values), job.path, elapsed)
+
+
+def _passed(outcome: Outcome) -> float:
+    return outcome.device_seconds + outcome.host_seconds + outcome.load_seconds
 
 
 def _first(event: Found, count: int) -> Found:

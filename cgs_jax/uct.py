@@ -14,6 +14,10 @@ What differs from plain UCT, and why:
   counted per try, and success within all tries follows by the product of Kaplan and Meier (1958).
 * What never ran is judged by its dof and rows (`guessed_success`), corrected by how the instance's operators that ran did
   in comparison; how many tries of a condition pay follows from what it cost.
+* The *incumbent*, the best sequence that was run to the end, is run unless another promises clearly more or it is time to
+  explore: near ties cost more than they are worth, since what was made for one waits in pools while another is run.
+* On another instance an operator may do worse than on those of a warm start: a history borrows how it did in comparison
+  with its operator there, so that none has to be refuted one by one.
 * Visits are counted in batches. Q is normalised among siblings by what the best of them could gain, so that `c_uct`
   depends neither on the unit of time nor on how rare samples are.
 
@@ -32,6 +36,7 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Literal, Protocol
 
 from cgs_jax.errors import InputError
@@ -85,13 +90,25 @@ PRICE_STEPS = 2
 """Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
 CURIOSITY = 0.05
-"""First trials of operators may take this share of the device time."""
+"""First trials of operators may take this share of the time."""
 
 CURIOUS_AFTER = 30
-"""Batches per operator of the graph, after which those that seem hopeless by their number of rows have a first trial too."""
+"""Batches per operator of the graph, after which those that seem hopeless by what they cost have a first trial too."""
 
-CURIOUS_EVERY = 16
+CURIOUS_EVERY = 4
 """Only one choice in so many asks for a first trial: what it reads may have to be made before, and that takes time too."""
+
+
+EXPLORATION = 0.5
+"""Batches per operator that may go into sequences which promise hardly more than the incumbent, the best one that was run to
+the end, for every factor e of the time beyond so many: near ties cost more than they are worth, since what was made for one
+waits while another is run. Exploration thins out as the logarithm does in UCB."""
+
+PROMISE = 1.2
+"""What promises more than the incumbent by this factor is run at once, however much was explored."""
+
+CLEARLY_MORE = 1.05
+"""By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
 
 
 @dataclass
@@ -151,34 +168,39 @@ class Statistics:
     @property
     def success_rate(self) -> float | None:
         """Success per condition within its tries; None without evidence."""
-        return _within(self._observed)[-1][0] if self._observed else None
+        return _within(self.observed)[-1][0] if self.observed else None
 
     @property
     def seconds_per_condition(self) -> float | None:
-        return _within(self._observed)[-1][1] * self.seconds / self.tries if self._observed else None
+        return _within(self.observed)[-1][1] * self.seconds / self.tries if self.observed else None
 
     @property
     def seconds_per_try(self) -> float | None:
         return self.seconds / self.tries if self.tries else None
 
     @property
-    def _observed(self) -> list[float]:
+    def observed(self) -> list[float]:
         """Success of each try that was made."""
         return [s / a for a, s in zip(self.attempts, self.successes, strict=True) if a > 0]
 
 
 @dataclass
 class Totals:
-    """Of a whole run: batches, rollouts (attempts at the root), finished samples, device seconds, and those of first trials.
+    """Of a whole run: batches, rollouts (attempts at the root), finished samples and the device seconds that were charged for
+    them, all but batches discounted.
 
-    All but batches are discounted.
+    From the first incumbent on, not discounted: batches, and spent, the seconds that they took as they passed for a worker; of
+    these those of the first trials of operators, and those for other histories than the incumbent's.
     """
 
     visits: float = 0.0
     rollouts: float = 0.0
     samples: float = 0.0
     seconds: float = 0.0
+    batches: float = 0.0
+    spent: float = 0.0
     first_trials: float = 0.0
+    explored: float = 0.0
 
 
 class Chooser(Protocol):
@@ -201,6 +223,7 @@ class Chooser(Protocol):
         successes: Counts,
         seconds: float,
         visits: float = 1.0,
+        spent: float | None = None,
     ) -> None: ...
 
     def tries(self, prefix: Path, transition: Transition) -> int: ...
@@ -267,11 +290,13 @@ class _History:
 
     tries: of a condition that are worth making. success, cost: expected, per condition. item_cost: expected device seconds
     per item of the component, with all that it was made of. prefixes: sequences by which it was made, none before.
+    borrowed: evidence of earlier instances. lean: what the success of each try was there, over the operator's: where an
+    operator does worse on this instance, all its histories are expected to, without being tried one by one.
     """
 
     __slots__ = (
-        "cost", "hopeful_cost", "hopeful_success", "item_cost", "made", "operator", "prefixes", "reads", "statistics",
-        "success", "tries", "version",
+        "borrowed", "cost", "hopeful_cost", "hopeful_success", "item_cost", "lean", "made", "operator", "prefixes", "reads",
+        "statistics", "success", "tries", "version",
     )  # fmt: skip
 
     def __init__(self, operator: _Operator, reads: tuple[_History, ...], made: State) -> None:
@@ -279,6 +304,8 @@ class _History:
         self.reads = reads
         self.made = made
         self.statistics = Statistics()
+        self.borrowed = Statistics()
+        self.lean: list[float] = []
         self.prefixes: list[Path] = []
         self.tries = 1
         self.success = self.cost = self.item_cost = self.hopeful_success = self.hopeful_cost = 0.0
@@ -287,12 +314,16 @@ class _History:
     def predict(self, trust: float) -> None:
         """trust: as for operators."""
         operator, own = self.operator, self.statistics
+        expected = operator.hazards
+        if self.lean:
+            expected = [min(h * self.lean[min(k, len(self.lean) - 1)], 1.0) for k, h in enumerate(expected)]
+            trust += self.borrowed.attempts[0]
         if own.attempts:
-            hazards = own.hazards(operator.hazards, trust)
+            hazards = own.hazards(expected, trust)
             known = trust + own.attempts[0]
             per_try = (own.seconds + OPERATOR_TIME_TRIES * operator.seconds_per_try) / (own.tries + OPERATOR_TIME_TRIES)
         else:
-            hazards, known, per_try = operator.hazards, trust, operator.seconds_per_try
+            hazards, known, per_try = expected, trust, operator.seconds_per_try
         read_cost = sum(read.item_cost for read in self.reads)
         self.item_cost = math.inf
         for k, (success, tries) in enumerate(_within(hazards), start=1):
@@ -300,7 +331,7 @@ class _History:
             if item_cost < self.item_cost:
                 self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
         self.hopeful_success, tries = _within(_hopeful(hazards, known))[self.tries - 1]
-        if own.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
+        if own.tries + self.borrowed.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
             self.hopeful_success, tries = operator.hopeful[self.tries - 1]
         self.hopeful_cost = tries * per_try
 
@@ -376,13 +407,14 @@ class _Records:
         successes: Counts,
         seconds: float,
         visits: float = 1.0,
+        spent: float | None = None,
     ) -> None:
         """One batch of `transition` after the sequence `prefix`.
 
         attempts, successes: how many first tries of a condition there were and how many of them succeeded, how many
         second ones, and so on; a number stands for first tries alone. Their length tells how often a condition may be
-        tried. seconds: device time; visits: batches. Raises InputError for impossible numbers and for a sequence that is
-        none.
+        tried. seconds: device time; visits: batches; spent: seconds as they passed, None where they are the same. Raises
+        InputError for impossible numbers and for a sequence that is none.
         """
         attempts = [attempts] if isinstance(attempts, int) else list(attempts)
         successes = [successes] if isinstance(successes, int) else list(successes)
@@ -406,11 +438,14 @@ class _Records:
         total.rollouts = keep * total.rollouts + (0 if prefix else sum(attempts))
         total.samples = keep * total.samples + (sum(successes) if transition.target == self.transitions.full else 0)
         total.seconds = keep * total.seconds + seconds
-        total.first_trials = keep * total.first_trials + (seconds if is_first_trial else 0.0)
+        self._spend(history, seconds if spent is None else spent, is_first_trial)
         self._recorded(lineage)
 
     def _recorded(self, lineage: list[_Edge]) -> None:
         """Called after every record with the edges from the root."""
+
+    def _spend(self, history: _History, seconds: float, is_first_trial: bool) -> None:
+        """Accounts for the time that a batch took."""
 
     @property
     def rate(self) -> float:
@@ -459,46 +494,69 @@ class _Records:
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
-        """The k sequences of greatest predicted rate, with that rate, out of operators that have run.
+        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end.
 
-        On a small graph out of all sequences, on a large one out of those that were run to the end. The best ones may
-        differ only in the order of independent steps, and then have equal rates.
+        The best ones may differ only in the order of independent steps, and then have equal rates.
         """
         self._predict_operators()
         if self._states is not None:
-            paths = self._cheapest_paths(k, lambda step: step.operator.statistics.visits > 0)[self.transitions.full]
+            paths = self._cheapest_paths(k, only_made=True)[self.transitions.full]
         else:
             paths = self._finished_paths()
         ranked = sorted(((path, self._rate_of(path)) for path in paths), key=lambda pair: -pair[1])
         return ranked[:k]
 
     def _rate_of(self, path: Path) -> float:
+        components, _ = self._made_along(path)
+        return 1.0 / max(sum(self._predicted(history).item_cost for history in components), 1e-300)
+
+    def _made_along(self, path: Path) -> tuple[tuple[_History, ...], tuple[_History, ...]]:
+        """The components that a sequence ends with, and all histories on the way."""
         components: tuple[_History, ...] = ()
+        histories: tuple[_History, ...] = ()
         for transition in path:
             history, kept = self._made_by(self._step(transition), components)
             components = (*kept, history)
-        return 1.0 / max(sum(self._predicted(history).item_cost for history in components), 1e-300)
+            histories = (*histories, history)
+        return components, histories
 
     def _finished_paths(self) -> list[Path]:
         full = self.transitions.full
         return [history.prefixes[0] for history in self._known if history.prefixes[0][-1].target == full]
 
-    def _cheapest_paths(self, k: int, among: Callable[[_Step], bool]) -> dict[State, list[Path]]:
-        """In every state the k partial sequences of least production cost, out of some steps, by a forward search."""
-        partial: dict[State, list[tuple[float, tuple[_History, ...], Path]]] = {state: [] for state in self._states}
-        partial[frozenset()] = [(0.0, (), ())]
+    def _cheapest_paths(
+        self, k: int, among: Callable[[_Step], bool] = lambda step: True, only_made: bool = False
+    ) -> dict[State, list[Path]]:
+        """In every state the k partial sequences of least production cost, out of some steps, by a forward search.
+
+        only_made: whether all their histories must have been made, here or on earlier instances.
+        """
+        # Cost, components, and the last transition with the label before it.
+        partial: dict[State, list[tuple[float, tuple[_History, ...], Any]]] = {state: [] for state in self._states}
+        partial[frozenset()] = [(0.0, (), None)]
         for state in self._states:
-            labels = sorted(partial[state], key=lambda label: label[0])[:k]
+            labels = sorted(partial[state], key=itemgetter(0))[:k]
             partial[state] = labels
             for step in self._steps_from(state).values():
                 if not among(step):
                     continue
-                for _, components, path in labels:
-                    history, kept = self._made_by(step, components)
-                    after = (*kept, history)
-                    cost = sum(self._predicted(component).item_cost for component in after)
-                    partial[step.target].append((cost, after, (*path, step.transition)))
-        return {state: [path for _, _, path in labels] for state, labels in partial.items()}
+                others = partial[step.target]
+                for label in labels:
+                    history, kept = self._made_by(step, label[1])
+                    if only_made and not history.prefixes:
+                        continue
+                    cost = self._predicted(history).item_cost + sum([component.item_cost for component in kept])
+                    if len(others) < k or cost < max(others, key=itemgetter(0))[0]:
+                        others.append((cost, (*kept, history), (step.transition, label)))
+
+        def path_to(label: Any) -> Path:
+            path: list[Transition] = []
+            while label[2] is not None:
+                transition, label = label[2]
+                path.append(transition)
+            return tuple(reversed(path))
+
+        return {state: [path_to(label) for label in labels] for state, labels in partial.items()}
 
     def _predict_operators(self) -> None:
         """Renew what operators predict; histories follow when they are asked."""
@@ -660,7 +718,7 @@ class _Records:
                 {
                     "sequence": self.transitions.format(history.prefixes[0]),
                     "also": [self.transitions.format(prefix) for prefix in history.prefixes[1:]],
-                    **_described(history.statistics),
+                    **_described(_sum(history.statistics, history.borrowed)),
                     **self._value_of(history),
                 }
                 for history in self._known
@@ -714,7 +772,9 @@ class _Records:
         for problem, statistics in of_operator.items():
             self._operator(problem).statistics = _averaged(statistics, n_equiv)
         for history, statistics in of_history.items():
-            history.statistics = _averaged(statistics, n_equiv)
+            history.borrowed = _averaged(statistics, n_equiv)
+            ours, pooled = history.borrowed.observed, history.operator.statistics.observed
+            history.lean = [our / max(all_, 1e-12) for our, all_ in zip(ours, pooled)]
         totals = [total for total in totals if total.visits and total.seconds]
         if totals:
             # Samples per second are averaged as they are; the weight is n_equiv visits of the mean length.
@@ -745,7 +805,7 @@ class Tree(_Records):
     def __init__(
         self,
         transitions: Transitions,
-        c_uct: float = 0.06,
+        c_uct: float = 0.005,
         reward: Literal["rate", "rollout"] = "rate",
         retain: bool = True,
         equivalent_visits: float = 4.0,
@@ -767,6 +827,8 @@ class Tree(_Records):
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
         self._choices = 0
+        self._incumbent: Path = ()
+        self._of_incumbent: frozenset[_History] = frozenset()
         self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
         self._epoch = 0  # of the values: they change with the price too
         self._edges_evaluated = 0
@@ -790,7 +852,9 @@ class Tree(_Records):
         """The sequence to run next, from the empty to the full set.
 
         ready: tells whether a transition's operator can run; asked of one transition per conditional problem. Without
-        a complete sequence of ready transitions the answer is ().
+        a complete sequence of ready transitions the answer is (). That is the incumbent, unless there is none, another one
+        is predicted to be much better, or it is time to explore (`EXPLORATION`) or to try an operator that never ran
+        (`CURIOSITY`).
         """
         self._ask_readiness(ready)
         if self._stale:
@@ -801,6 +865,23 @@ class Tree(_Records):
             untried = self._path_to_untried()
             if untried:
                 return untried
+        incumbent = self._incumbent
+        if not incumbent or self._any_unready and not all(self._is_ready(self._step(t)) for t in incumbent):
+            return self._promising(price)
+        exploring = self._total.explored <= self._allowed_to_explore
+        if exploring or self._states is None:
+            path = self._promising(price)
+            if exploring and path != incumbent:
+                return path
+        else:
+            path = ()
+        # The greatest of all predicted rates, whether it was run to the end or not.
+        path = next(iter(self._prefixes.get(self.transitions.full, ())), path)
+        more = CLEARLY_MORE if exploring else PROMISE
+        return path if path and self._rate_of(path) > more * self._rate_of(incumbent) else incumbent
+
+    def _promising(self, price: float) -> Path:
+        """The sequence that the tree chooses by Q and bonus, step by step; () where none is ready."""
         node = self._root
         path: list[Transition] = []
         while node.state != self.transitions.full:
@@ -824,21 +905,53 @@ class Tree(_Records):
         return tuple(path)
 
     @property
+    def _allowed_to_explore(self) -> float:
+        """Seconds that may have gone by now into other sequences than the incumbent."""
+        total, batches = self._total, EXPLORATION * len(self._operators)
+        if not total.batches:
+            return 0.0
+        return batches * math.log1p(total.batches / batches) * total.spent / total.batches
+
+    def _spend(self, history: _History, seconds: float, is_first_trial: bool) -> None:
+        if self._incumbent:
+            self._total.batches += 1.0
+            self._total.spent += seconds
+            self._total.first_trials += seconds * is_first_trial
+            self._total.explored += seconds * (history not in self._of_incumbent)
+
+    def _renew_incumbent(self) -> None:
+        """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more."""
+        if self.reward != "rate":
+            return
+        rates = [(self._rate_of(path), path) for path in self._finished_paths()]
+        rate, path = max(rates, default=(0.0, ()), key=lambda pair: pair[0])
+        if path and (not self._incumbent or rate > CLEARLY_MORE * self._rate_of(self._incumbent)):
+            self._incumbent, self._of_incumbent = path, frozenset(self._made_along(path)[1])
+
+    @property
     def _curious(self) -> bool:
         if self._states is None or self._choices % CURIOUS_EVERY:
             return False
-        if self._total.visits < CURIOUS_AFTER * len(self._representatives):
-            return False
-        return self._total.first_trials <= CURIOSITY * self._total.seconds
+        return self._total.first_trials <= CURIOSITY * self._total.spent
 
     def _path_to_untried(self) -> Path:
-        """A sequence with an operator that never ran: the smallest one after the cheapest prefix; () where all have run."""
+        """A sequence with an operator that never ran: the smallest one after the cheapest prefix; () where all have run.
+
+        One that costs more per try, with all that it reads, than a sample of the best sequence is hopeless and comes last.
+        """
         found: tuple[tuple[float, int], Path] | None = None
+        patient = self._total.visits < CURIOUS_AFTER * len(self._representatives)
+        most = 1.0 / self.price if patient and self.price else math.inf
         for state, steps in self._backwards:
             for path in self._prefixes.get(state, []):
+                components, _ = self._made_along(path)
                 for step, _ in steps:
-                    size = step.operator.guess, len(path)
-                    if not step.operator.statistics.visits and step.operator.ready and (found is None or size < found[0]):
+                    operator = step.operator
+                    if operator.statistics.visits or not operator.ready:
+                        continue
+                    reads = sum(self._predicted(c).item_cost for c in components if c.made in step.used)
+                    size = operator.guess, len(path)
+                    if reads + operator.seconds_per_try < most and (found is None or size < found[0]):
                         found = size, (*path, step.transition)
         return self._completed(found[1]) if found else ()
 
@@ -867,7 +980,7 @@ class Tree(_Records):
         counts = []
         for edge in edges:
             pooled = edge.step.operator.statistics.visits
-            own = edge.history.statistics.visits
+            own = edge.history.statistics.visits + edge.history.borrowed.visits
             count = own + min(max(pooled - own, 0.0), self.equivalent_visits)
             counts.append(count or UNTRIED_VISITS)
         greatest = max(edges, key=lambda edge: edge.quality)
@@ -942,7 +1055,7 @@ class Tree(_Records):
         made = lineage[-1].history
         first_time = made.operator.statistics.visits <= made.statistics.visits <= 1.0
         # A refresh visits every edge of the tree: its cost is spread over a proportional number of records.
-        if first_time or self._records_since_refresh > max(12, self._edges_evaluated // 16):
+        if first_time or self._records_since_refresh > max(48, self._edges_evaluated // 16):
             self._stale = True
         if self._stale:
             return
@@ -979,6 +1092,7 @@ class Tree(_Records):
                     break
                 self._attainable = attainable
                 self._value_at(self.price)
+        self._renew_incumbent()
         self._records_since_refresh = 0
         self._stale = False
 
@@ -1228,9 +1342,9 @@ def guessed_success(graph: ConstraintGraph, problem: Problem) -> tuple[int, floa
 def _bonus(x: float) -> float:
     """sqrt(x) with x = ln N / n_i as in the paper, but x^2 / 4 where that is more: for n_i below 0.4 ln N.
 
-    A model-based Q wants a small c_uct (0.03: near ties are told apart by few batches). With the square root alone the
-    worst child would then come back when ln N = n_i / c_uct^2, that is never. With the square it comes back when
-    ln N = 2 n_i / sqrt(c_uct), for the first time at N = 10^5, for a bonus that only hardly tried children have.
+    A model-based Q wants a small c_uct (near ties are told apart by few batches). With the square root alone the
+    worst child would then come back when ln N = n_i / c_uct^2. With the square it comes back when ln N = 2 n_i / sqrt(c_uct),
+    much sooner, for a bonus that only hardly tried children have.
     """
     return max(math.sqrt(x), 0.25 * x * x)
 
@@ -1252,6 +1366,13 @@ def _within(hazards: Sequence[float]) -> list[tuple[float, float]]:
 
 def _add(to: Statistics, other: Statistics) -> None:
     to.add(other.visits, other.attempts, other.successes, other.seconds)
+
+
+def _sum(first: Statistics, second: Statistics) -> Statistics:
+    total = Statistics()
+    _add(total, first)
+    _add(total, second)
+    return total
 
 
 def _described(statistics: Statistics) -> dict[str, Any]:
@@ -1296,13 +1417,18 @@ def _operators_in(transitions: Transitions, data: dict[str, Any]) -> dict[Proble
 
 
 def _averaged(earlier: list[Statistics], n_equiv: float) -> Statistics:
-    """Mean success of each try and mean seconds per try over instances, with the weight of n_equiv batches."""
+    """Mean success of each try and mean seconds per try over instances, with the weight of n_equiv batches.
+
+    Where instances differ much in the success of first tries the weight is less: that of the beta distribution with the
+    variance between them, beyond that of the counts.
+    """
     earlier = [statistics for statistics in earlier if statistics.tries]
     if not earlier:
         return Statistics()
     visits = min(n_equiv, sum(statistics.visits for statistics in earlier))
     per_visit = sum(s.tries / max(s.visits, 1e-9) for s in earlier) / len(earlier)
     seconds = sum(s.seconds_per_try for s in earlier) / len(earlier)
+    visits *= min(1.0, _agreement(earlier) / max(visits * per_visit, 1e-9))
     attempts, successes = [], []
     for k in range(max(len(s.attempts) for s in earlier)):
         reached = [s for s in earlier if k < len(s.attempts) and s.attempts[k]]
@@ -1311,3 +1437,15 @@ def _averaged(earlier: list[Statistics], n_equiv: float) -> Statistics:
         attempts.append(visits * per_visit * share)
         successes.append(attempts[-1] * hazard)
     return Statistics(visits, attempts, successes, sum(attempts) * seconds)
+
+
+def _agreement(earlier: list[Statistics]) -> float:
+    """Weight in tries that the mean success of first tries has for another instance: by moments, at least one try."""
+    tried = [s for s in earlier if s.attempts and s.attempts[0]]
+    hazards = [s.successes[0] / s.attempts[0] for s in tried]
+    if len(tried) < 2:
+        return math.inf
+    mean = sum(hazards) / len(hazards)
+    of_counts = sum(mean * (1.0 - mean) / s.attempts[0] for s in tried) / len(tried)
+    between = sum((h - mean) ** 2 for h in hazards) / (len(hazards) - 1) - of_counts
+    return max(mean * (1.0 - mean) / between - 1.0, 1.0) if between > 0.0 else math.inf
