@@ -190,6 +190,7 @@ class BatchRunner:
         replaced = programs.request_anew(*self._recipes(operator)[position])
         with self._lock:
             self._requested[operator.identity] = list(self._requested[operator.identity])
+            self._distinct.pop(id(self._requested[operator.identity][position]), None)
             self._requested[operator.identity][position] = replaced
             self._distinct[id(replaced)] = replaced
         return replaced.result()
