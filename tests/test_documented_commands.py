@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import mkdtemp
 
 import made_up
 import pytest
@@ -157,10 +158,10 @@ def benchmark(arguments, monkeypatch):
 
 
 def reproduce(arguments, monkeypatch):
-    """`scripts/reproduce.py` with made-up runs."""
+    """`scripts/reproduce.py` with made-up runs, in a folder of its own."""
     monkeypatch.setattr(study, "execute", functools.partial(made_up.run, scale=0.2))
     monkeypatch.setattr(study, "prepare", lambda problem, settings: iter(()))
-    return load_script("scripts/reproduce.py").main([*arguments, *MADE_UP_STUDY])
+    return load_script("scripts/reproduce.py").main([*arguments, *MADE_UP_STUDY, "--out", mkdtemp(dir=".")])
 
 
 REHEARSED = {"scripts/benchmark.py": benchmark, "scripts/reproduce.py": reproduce}
