@@ -52,18 +52,15 @@ class Batch:
     tasks: int
     first_task: int
     """Number of the first task in the operator's random stream."""
-    completes: bool
-    """Whether successes are full samples, to be audited."""
 
 
 @dataclass(frozen=True)
 class Audited:
-    """Full samples that passed the audit."""
+    """What the audit says of full samples."""
 
-    values: Values
+    ok: np.ndarray  # (N,) bool
     qpos: np.ndarray  # (N, K, nq)
     violation: np.ndarray  # (N, C)
-    rejected: int
     seconds: float
 
 
@@ -83,7 +80,6 @@ class Outcome:
     host_seconds: float
     load_seconds: float
     """Until its programs were there."""
-    audited: Audited | None
 
 
 @dataclass(frozen=True)
@@ -236,7 +232,7 @@ class BatchRunner:
     # -------------------------------------------------------------- running
 
     def run(self, batch: Batch) -> Outcome:
-        """Runs one batch and, where it completes samples, audits them. Waits for its programs."""
+        """Runs one batch. Waits for its programs."""
         operator, problem = operator_of(self.problem, batch.transition), self.problem
         asked = time.perf_counter()
         self.load(operator)
@@ -289,22 +285,17 @@ class BatchRunner:
                 values = {name: value[clears] for name, value in values.items()}
         mask = np.zeros(count, bool)
         mask[success] = True
-        audited = self.audit(values) if batch.completes and len(success) else None
-        audit_seconds = audited.seconds if audited else 0.0
-        host = max(time.perf_counter() - began - device - audit_seconds, 0.0)
+        host = max(time.perf_counter() - began - device, 0.0)
         if self.settings.counted_time:
             device = WORK_SECONDS * (count + iterations) * (1 + operator.plan.layout.unknowns)
-        return Outcome(values, mask, proposed, iterations, failures, device, host, began - asked, audited)
+        return Outcome(values, mask, proposed, iterations, failures, device, host, began - asked)
 
     def audit(self, values: Values) -> Audited:
         """Keyframes and audit of full samples."""
         began = time.perf_counter()
         qpos = self._keyframes.qpos(values)
         result = self.auditor.check(qpos, values)
-        kept = np.flatnonzero(result.ok)
-        values = {name: value[kept] for name, value in values.items()}
-        rejected = len(qpos) - len(kept)
-        return Audited(values, qpos[kept], result.violation[kept], rejected, time.perf_counter() - began)
+        return Audited(result.ok, qpos, result.violation, time.perf_counter() - began)
 
 
 def _fill(value: np.ndarray, rows: int) -> np.ndarray:

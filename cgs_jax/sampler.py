@@ -161,6 +161,20 @@ class _Job:
     """Whether it is one of the first batches in its place."""
 
 
+@dataclass(frozen=True)
+class _Candidates:
+    """Full samples of one batch, to be audited."""
+
+    path: Path
+    makes: History
+    """Of the last step of the path."""
+    values: Values
+
+    @property
+    def size(self) -> int:
+        return len(next(iter(self.values.values())))
+
+
 BATCH_SECONDS = 0.04
 """Device time that a batch should take."""
 
@@ -185,6 +199,12 @@ LEAST_UNKNOWNS = 7
 
 REPRESENTATIVE = 128
 """Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
+
+AUDIT_SAMPLES = 2048
+"""Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
+
+AUDIT_BATCHES = 8
+"""Batches after which full samples are audited, however few there are."""
 
 TRIES = 0
 """Name under which the number of earlier tries travels with a waiting condition (no variable can be called that)."""
@@ -294,6 +314,9 @@ class _Crew:
         """Whoever is free next; if some worker has the programs of an operator, one of those."""
         with self._changed:
             while True:
+                # With all workers there, this process has its core for compiling and deciding.
+                if self._complete() and self._local in self._free:
+                    self._free.remove(self._local)
                 able = [member for member in self._arrived if operator is not None and self._has(member, operator)]
                 for member in self._free:
                     if not able or member in able:
@@ -329,8 +352,7 @@ class _Crew:
         if self._refusal is not None:
             raise self._refusal
         operator = operator_of(self._local.problem, batch.transition)
-        complete = self._workers and len(self._arrived) == self._wanted
-        if look and not complete:
+        if look and not self._complete():
             if not self._local.is_aimed(operator):
                 member = self._take()
                 try:
@@ -340,9 +362,6 @@ class _Crew:
             return self._local.run(batch)
         # To read a program takes longer than to look: not more than one worker does it for that.
         member = self._take(operator if look else None)
-        # With all workers there, this process has its core for compiling and deciding.
-        if member is self._local and complete:
-            member = self._take(operator if look else None)
         try:
             if isinstance(member, Worker):
                 self._aim(member, operator, batch.transition)
@@ -351,6 +370,17 @@ class _Crew:
             return member.run(batch)
         finally:
             self._release(member)
+
+    def audit(self, values: Values) -> Audited:
+        """Audits full samples on whoever is free."""
+        member = self._take()
+        try:
+            return member.audit(values)
+        finally:
+            self._release(member)
+
+    def _complete(self) -> bool:
+        return bool(self._workers) and len(self._arrived) == self._wanted
 
     def _aim(self, member: BatchRunner | Worker, operator: Operator, transition: Transition) -> None:
         """Sees to it that the operator's seed tables are made; once, since whoever runs a batch gets them from here."""
@@ -390,6 +420,9 @@ class Sampler:
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
+        self._candidates: list[_Candidates] = []
+        self._batches_waited = 0  # by the first of them
+        self._refused: defaultdict[History, int] = defaultdict(int)  # by the audit, and not yet taken off the successes
         self._pace = _Pace(s.lanes, s.batch_size)
         self._made: defaultdict[int, set[History]] = defaultdict(set)  # by operator
         self._pursued: Path = ()
@@ -474,7 +507,7 @@ class Sampler:
         found = 0
         reason = "time"
         threads = ThreadPoolExecutor(self.settings.workers + 1, thread_name_prefix="sample")
-        in_flight: list[tuple[_Job, Future[Outcome]]] = []
+        in_flight: list[tuple[_Job | list[_Candidates], Future[Any]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
         try:
             while True:
@@ -491,12 +524,17 @@ class Sampler:
                 # One more than run at once waits, so that no worker does.
                 most = self.settings.workers if self.settings.deterministic else crew.size + 2
                 while len(in_flight) < most:
-                    job = self._next_job()
-                    if job is None:
-                        break
-                    future = threads.submit(crew.run, job.batch, job.look)
+                    work: _Job | list[_Candidates] | None
+                    if self._audit_due(found, num_samples):
+                        work = self._take_candidates()
+                        future: Future[Any] = threads.submit(crew.audit, _together(work))
+                    else:
+                        work = self._next_job()
+                        if work is None:
+                            break
+                        future = threads.submit(crew.run, work.batch, work.look)
                     future.add_done_callback(lambda _: done.put(None))
-                    in_flight.append((job, future))
+                    in_flight.append((work, future))
                 yield from self._announcements()
                 if not in_flight:
                     time.sleep(0.002)
@@ -508,13 +546,22 @@ class Sampler:
                 at = 0
                 if not self.settings.deterministic:
                     at = next(i for i, (_, future) in enumerate(in_flight) if future.done())
-                job, future = in_flight.pop(at)
-                for event in self._absorb(job, future.result(), clock() - start):
-                    if isinstance(event, Found):
-                        if num_samples is not None and found + len(event.qpos) > num_samples:
-                            event = _first(event, num_samples - found)
-                        found += len(event.qpos)
+                work, future = in_flight.pop(at)
+                if isinstance(work, _Job):
+                    yield self._absorb(work, future.result())
+                    continue
+                for event in self._found(work, future.result(), clock() - start):
+                    if num_samples is not None and found + len(event.qpos) > num_samples:
+                        event = _first(event, num_samples - found)
+                    found += len(event.qpos)
                     yield event
+            # What was finished in time is not thrown away.
+            for work, future in in_flight:
+                if not isinstance(work, _Job) and reason != "samples":
+                    yield from self._found(work, future.result(), clock() - start)
+            if self._candidates and reason != "samples":
+                rest = self._take_candidates()
+                yield from self._found(rest, self._runner.audit(_together(rest)), clock() - start)
         finally:
             threads.shutdown(wait=True, cancel_futures=True)
             crew.close()
@@ -676,12 +723,11 @@ class Sampler:
             count = len(tries)
         first = self._tasks.get(step.operator.identity, 0)
         self._tasks[step.operator.identity] = first + count
-        completes = step.transition.target == self._full and not self._final_histories(path)
-        return _Job(path, position, step, Batch(step.transition, conditions, count, first, completes), tries, look)
+        return _Job(path, position, step, Batch(step.transition, conditions, count, first), tries, look)
 
     # -------------------------------------------------------------- results
 
-    def _absorb(self, job: _Job, outcome: Outcome, elapsed: float) -> Iterator[Event]:
+    def _absorb(self, job: _Job, outcome: Outcome) -> Ran:
         success = outcome.success
         self._looked_at.discard(job.step.makes)
         given_up = ~success
@@ -693,8 +739,28 @@ class Sampler:
                 part = {name: value[again] for name, value in job.batch.conditions.items()}
                 waiting = self._waiting[job.step.makes]
                 waiting.put(part | {TRIES: job.tries[again] + 1})
+        operator = job.step.operator
+        seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds, job.look)
+        allowed = self.settings.tries if job.step.reads else 1
+        attempts = np.bincount(job.tries, minlength=allowed)
+        successes = np.bincount(job.tries[success], minlength=allowed)
+        # The audit speaks later: what it refused is taken off the successes that come next.
+        refused = min(self._refused[job.step.makes], int(successes.max()))
+        self._refused[job.step.makes] -= refused
+        successes[successes.argmax()] -= refused
+        self.chooser.record(
+            job.path[: job.position],
+            job.step.transition,
+            attempts=attempts.tolist(),
+            successes=successes.tolist(),
+            seconds=seconds,
+            spent=outcome.device_seconds if self.settings.deterministic else _passed(outcome),
+        )
+        self._batches_waited += bool(self._candidates)
+        if success.any():
+            self._keep(job, outcome.values)
         first, second = job.tries == 0, job.tries == 1
-        yield Ran(
+        return Ran(
             path=job.path,
             position=job.position,
             tasks=len(success),
@@ -709,49 +775,64 @@ class Sampler:
             device_seconds=outcome.device_seconds,
             host_seconds=outcome.host_seconds,
         )
-        audited = outcome.audited
-        operator = job.step.operator
-        seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds, job.look)
-        allowed = self.settings.tries if job.step.reads else 1
-        attempts = np.bincount(job.tries, minlength=allowed)
-        successes = np.bincount(job.tries[success], minlength=allowed)
-        if audited is not None and audited.rejected:
-            successes[successes.argmax()] -= min(audited.rejected, successes.max())
-        self.chooser.record(
-            job.path[: job.position],
-            job.step.transition,
-            attempts=attempts.tolist(),
-            successes=successes.tolist(),
-            seconds=seconds,
-            spent=outcome.device_seconds if self.settings.deterministic else _passed(outcome),
-        )
-        if audited is not None:
-            yield self._found(audited, job.path, elapsed)
-        elif not job.batch.completes:
-            self._pool(job.step.makes).put(outcome.values)
-            if job.step.transition.target == self._full:
-                yield from self._join(job, elapsed)
 
-    def _found(self, audited: Audited, path: Path, elapsed: float) -> Found:
-        return Found(
-            values=audited.values,
-            qpos=audited.qpos,
-            violation=audited.violation,
-            sequence=self.problem.transitions.format(path),
-            elapsed=elapsed,
-            rejected=audited.rejected,
-            audit_seconds=audited.seconds,
-        )
-
-    def _join(self, job: _Job, elapsed: float) -> Iterator[Event]:
-        """Full samples from components that no constraint links."""
-        pools = [self._pool(history) for history in (job.step.makes, *self._final_histories(job.path))]
-        count = min(pool.size for pool in pools)
-        if count:
-            values: Values = {}
+    def _keep(self, job: _Job, values: Values) -> None:
+        """Puts what a batch made into the pool of its component; full samples wait for the audit."""
+        step = job.step
+        if step.transition.target != self._full:
+            self._pool(step.makes).put(values)
+            return
+        others = self._final_histories(job.path)
+        if others:  # components that no constraint links
+            self._pool(step.makes).put(values)
+            pools = [self._pool(history) for history in (step.makes, *others)]
+            count = min(pool.size for pool in pools)
+            if not count:
+                return
+            values = {}
             for pool in pools:
                 values |= pool.take(count)
-            yield self._found(self._runner.audit(values), job.path, elapsed)
+        self._candidates.append(_Candidates(job.path, step.makes, values))
+
+    # -------------------------------------------------------------- the audit
+
+    def _audit_due(self, found: int, wanted: int | None) -> bool:
+        """Whether to audit what waits: the first samples, enough to finish, many, or some that have waited."""
+        if not self._candidates:
+            return False
+        waiting = sum(candidates.size for candidates in self._candidates)
+        many = AUDIT_SAMPLES if wanted is None else min(AUDIT_SAMPLES, wanted - found)
+        return not found or waiting >= many or self._batches_waited >= AUDIT_BATCHES
+
+    def _take_candidates(self) -> list[_Candidates]:
+        taken, self._candidates, self._batches_waited = self._candidates, [], 0
+        return taken
+
+    def _found(self, candidates: list[_Candidates], audited: Audited, elapsed: float) -> Iterator[Found]:
+        """What passed, one event for each sequence, with its share of the time."""
+        values = _together(candidates)
+        made_by = np.repeat(np.arange(len(candidates)), [part.size for part in candidates])
+        by_path: dict[Path, list[int]] = {}
+        for number, part in enumerate(candidates):
+            by_path.setdefault(part.path, []).append(number)
+            self._refused[part.makes] += int((~audited.ok[made_by == number]).sum())
+        for path, numbers in by_path.items():
+            theirs = np.isin(made_by, numbers)
+            passed = theirs & audited.ok
+            yield Found(
+                values={name: value[passed] for name, value in values.items()},
+                qpos=audited.qpos[passed],
+                violation=audited.violation[passed],
+                sequence=self.problem.transitions.format(path),
+                elapsed=elapsed,
+                rejected=int((theirs & ~audited.ok).sum()),
+                audit_seconds=audited.seconds * float(theirs.mean()),
+            )
+
+
+def _together(candidates: list[_Candidates]) -> Values:
+    names = candidates[0].values
+    return {name: np.concatenate([part.values[name] for part in candidates]) for name in names}
 
 
 def _passed(outcome: Outcome) -> float:

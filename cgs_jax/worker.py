@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 from cgs_jax import cache
 from cgs_jax.audit import Tolerances
-from cgs_jax.batches import AimedTables, Batch, BatchRunner, BatchSettings, Outcome
+from cgs_jax.batches import AimedTables, Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
 from cgs_jax.problems import load_problem
@@ -50,6 +50,13 @@ class Aim:
     """Asks for the seed tables of a transition's operator."""
 
     transition: Transition
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Asks whether full samples pass the audit."""
+
+    values: Values
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,11 @@ class Worker:
         """Runs one batch there. Raises what the worker raised, or RuntimeError when it is gone."""
         return self._ask(batch)
 
-    def _ask(self, message: Batch | Aim) -> Any:
+    def audit(self, values: Values) -> Audited:
+        """Audits full samples there. Raises as `run` does."""
+        return self._ask(Audit(values))
+
+    def _ask(self, message: Batch | Aim | Audit) -> Any:
         try:
             self._send(message)
             answer = pickle.load(self._pipe_from())
@@ -199,7 +210,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     loaded: dict[int, Program | None] = {}
     while True:
         try:
-            message: Setup | Aim | Install | Batch = pickle.load(source)
+            message: Setup | Aim | Audit | Install | Batch = pickle.load(source)
         except EOFError:
             return
         try:
@@ -217,6 +228,8 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
                 runner.take_aimed(message.identity, message.aimed)
             elif isinstance(message, Aim):
                 answer(runner.aimed(operator_of(runner.problem, message.transition)))
+            elif isinstance(message, Audit):
+                answer(runner.audit(message.values))
             else:
                 answer(runner.run(message))
         except Exception as error:  # noqa: BLE001 - sent to the process that asked

@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
 
 def grasps():
     at = problem("pick_place")
-    return at, Batch(conditional(at, (), ("t",)), {}, 64, 0, completes=False)
+    return at, Batch(conditional(at, (), ("t",)), {}, 64, 0)
 
 
 def foreign():
