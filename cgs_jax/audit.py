@@ -151,14 +151,14 @@ class Auditor:
         switches = len(self.mode_switches)
         if qpos.ndim != 3 or qpos.shape[1:] != (switches, self._nq):
             raise InputError(f"qpos has shape {qpos.shape}, expected (N, {switches}, {self._nq})")
-        finite = np.isfinite(qpos).all(axis=(1, 2))
+        finite = _finite_rows(qpos.reshape(len(qpos), switches * self._nq))
         stored: dict[str, Floats] = {}
         for name, value in (values or {}).items():
             stored[name] = np.asarray(value, dtype=np.float64)
             columns = 7 if name in self._poses else stored[name].shape[-1]
             if stored[name].shape != (len(qpos), columns):
                 raise InputError(f"variable {name!r} has shape {stored[name].shape}, expected ({len(qpos)}, {columns})")
-            finite &= np.isfinite(stored[name]).all(axis=1)
+            finite &= _finite_rows(stored[name])
         for name in (name for check in self._own for name in check.scope):
             if name not in stored:
                 raise InputError(f"no values of {name!r}, which a condition reads; available: {', '.join(stored) or 'none'}")
@@ -172,7 +172,9 @@ class Auditor:
             part = {name: value[chunk] for name, value in stored.items()}
             violation[chunk] = self._check_chunk(qpos[chunk], part, scratch)
         self._contacts.give_back(scratch)
-        return AuditResult((violation <= self.tolerance).all(axis=1), violation, self.constraints, self.tolerance)
+        # Numpy reduces over the first axis many times faster than over a short last one.
+        within = (violation <= self.tolerance).T.copy()
+        return AuditResult(within.all(axis=0), violation, self.constraints, self.tolerance)
 
     def _check_chunk(self, qpos: Floats, stored: Mapping[str, Floats], scratch: _Scratch) -> Floats:
         count, switches, nq = qpos.shape
@@ -186,7 +188,7 @@ class Auditor:
             configurations[switch] = _Configuration(parts)
         columns = [error for condition in self._conditions for error in condition.errors(configurations, stored)]
         columns += list(penetration)
-        beyond, deviation = self._joints.errors(qpos)
+        beyond, deviation = (error.reshape(switches, count).max(axis=0) for error in self._joints.errors(lanes))
         for name in self._poses & stored.keys():
             deviation = np.maximum(deviation, np.abs(np.linalg.norm(stored[name][:, 3:], axis=1) - 1.0))
         columns += [beyond, deviation, *(check.violation(stored) for check in self._own)]
@@ -533,20 +535,25 @@ class _Joints:
         self.quaternions = np.concatenate([address[ball], address[free] + 3])
 
     def errors(self, qpos: Floats) -> list[Floats]:
-        """Worst excess over a limit and worst deviation from unit length, (N,) each, at qpos (N, K, nq)."""
-        beyond = np.zeros(len(qpos))
+        """Worst excess over a limit and worst deviation from unit length, (B,) each, at qpos (nq, B)."""
+        beyond = np.zeros(qpos.shape[1])
         if self.scalars.size:
-            q = qpos[:, :, self.scalars]
-            beyond = np.maximum(beyond, np.maximum(self.low - q, q - self.high).max(axis=(1, 2)))
+            q = qpos[self.scalars]
+            beyond = np.maximum(beyond, np.maximum(self.low[:, None] - q, q - self.high[:, None]).max(axis=0))
         for address, limit in zip(self.balls, self.ball_limit, strict=True):
-            quat = qpos[:, :, address : address + 4]
-            angle = 2.0 * np.arctan2(np.linalg.norm(quat[..., 1:], axis=-1), np.abs(quat[..., 0]))
-            beyond = np.maximum(beyond, (angle - limit).max(axis=1))
-        length = np.zeros(len(qpos))
+            quat = qpos[address : address + 4]
+            angle = 2.0 * np.arctan2(_norm(quat[1:]), np.abs(quat[0]))
+            beyond = np.maximum(beyond, angle - limit)
+        length = np.zeros(qpos.shape[1])
         for address in self.quaternions:
-            deviation = np.abs(np.linalg.norm(qpos[:, :, address : address + 4], axis=-1) - 1.0)
-            length = np.maximum(length, deviation.max(axis=1))
+            length = np.maximum(length, np.abs(_norm(qpos[address : address + 4]) - 1.0))
         return [beyond, length]
+
+
+def _finite_rows(rows: Floats) -> NDArray[np.bool_]:
+    """Which rows (N, M) have finite numbers only."""
+    finite = np.isfinite(rows)
+    return np.ones(len(rows), dtype=bool) if finite.all() else finite.all(axis=1)
 
 
 # Contacts -----------------------------------------------------------------------------------------------------------

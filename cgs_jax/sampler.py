@@ -200,10 +200,10 @@ LEAST_UNKNOWNS = 7
 REPRESENTATIVE = 128
 """Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
 
-AUDIT_SAMPLES = 2048
+AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
-AUDIT_BATCHES = 8
+AUDIT_BATCHES = 12
 """Batches after which full samples are audited, however few there are."""
 
 TRIES = 0
