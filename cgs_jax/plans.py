@@ -414,7 +414,9 @@ class _Assembler:
             words=words,
             given=first_tool - self.sites - 1,
             sites=self.sites,
-            length=_rounded(max([len(product) for product in products + outputs], default=1), 12),
+            # A word may go through the tools of all new configurations: many of them have long words somewhere. A program
+            # that loops over few atoms takes as long with room for more, and one program less has to be compiled.
+            length=_rounded(max([4 * len(self.order), *(len(product) for product in products + outputs)]), 12),
             tool_places=_rounded(max(len(of_configurations), 1), 4 * words) if self.order else 0,
             free_places=_rounded(max(len(of_free), 1), 4 * words) if self.free else 0,
             constraints=_rounded(len(constraints), 16),

@@ -25,6 +25,9 @@ from jax.experimental import serialize_executable
 
 from cgs_jax import cache
 
+THREADS = 2
+"""Programs that are compiled at once: tracing holds the interpreter, generating code does not, and two threads overlap them."""
+
 _numbers = itertools.count()
 _lock = threading.Lock()
 _compiled: dict[Any, Future] = {}
@@ -155,8 +158,7 @@ def request(name: str, function: Callable, arguments: tuple, key: str | None = N
     with _lock:
         if known not in _compiled:
             if _pool is None:
-                # Tracing holds the interpreter, generating code does not: two threads overlap them.
-                _pool = ThreadPoolExecutor(2, thread_name_prefix="compile")
+                _pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
             shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), arguments)
             _compiled[known] = _pool.submit(_make, name, function, shapes, key)
         return _compiled[known]

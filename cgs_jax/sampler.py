@@ -13,6 +13,7 @@ process; all decisions are made by the one scheduling thread.
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 import time
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from cgs_jax import programs
 from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
@@ -318,7 +320,8 @@ class _Crew:
                 if self._complete() and self._local in self._free:
                     self._free.remove(self._local)
                 able = [member for member in self._arrived if operator is not None and self._has(member, operator)]
-                for member in self._free:
+                # The last one first: where not all are needed the others do not have to read programs.
+                for member in reversed(self._free):
                     if not able or member in able:
                         self._free.remove(member)
                         return member
@@ -520,9 +523,7 @@ class Sampler:
                 if num_samples is not None and found >= num_samples:
                     reason = "samples"
                     break
-                # What is decided must not depend on when the workers arrive.
-                # One more than run at once waits, so that no worker does.
-                most = self.settings.workers if self.settings.deterministic else crew.size + 2
+                most = self._most_in_flight(crew)
                 while len(in_flight) < most:
                     work: _Job | list[_Candidates] | None
                     if self._audit_due(found, num_samples):
@@ -566,6 +567,17 @@ class Sampler:
             threads.shutdown(wait=True, cancel_futures=True)
             crew.close()
         yield Finished(reason, clock() - start)
+
+    def _most_in_flight(self, crew: _Crew) -> int:
+        """Batches in flight from now on; in a deterministic run always the same."""
+        if self.settings.deterministic:
+            return self.settings.workers
+        # What a search may choose is worth more than what it makes meanwhile: cores for the compiler come first.
+        beside_compiler = max((os.cpu_count() or 1) - programs.THREADS, 1)
+        if beside_compiler < self.settings.workers and not self._all_ready():
+            return beside_compiler
+        # More than run at once wait, so that no worker does.
+        return crew.size + 2
 
     def _crew(self) -> _Crew:
         source, workers = self.problem.source, self.settings.workers
