@@ -216,7 +216,7 @@ TRIES = 0
 class SamplerSettings:
     """How a run is scheduled."""
 
-    batch_size: int = 1024
+    batch_size: int = 2048
     """Tasks of one batch."""
     lanes: int = 128
     """Tasks solved side by side."""

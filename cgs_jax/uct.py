@@ -89,7 +89,7 @@ HOPE = 0.5
 PRICE_STEPS = 2
 """Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
-CURIOSITY = 0.05
+CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
 CURIOUS_AFTER = 30
