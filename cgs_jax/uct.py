@@ -92,6 +92,9 @@ PRICE_STEPS = 2
 CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
+TRIAL_SECONDS = 0.1
+"""What a first trial takes a worker, with the reading of programs: after a warm start as much must have been saved up for it."""
+
 CURIOUS_AFTER = 30
 """Batches per operator of the graph, after which those that seem hopeless by what they cost have a first trial too."""
 
@@ -827,6 +830,7 @@ class Tree(_Records):
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
         self._choices = 0
+        self._earlier_batches = 0.0  # of earlier instances
         self._incumbent: Path = ()
         self._of_incumbent: frozenset[_History] = frozenset()
         self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
@@ -842,6 +846,11 @@ class Tree(_Records):
             return max(self.rate, self._attainable)
         seconds = self.seconds_per_rollout
         return 1.0 / seconds if seconds else 0.0
+
+    @property
+    def incumbent(self) -> Path:
+        """The sequence that is run unless another promises more; () until there is one."""
+        return self._incumbent
 
     @property
     def c_hat(self) -> float | None:
@@ -868,7 +877,7 @@ class Tree(_Records):
         incumbent = self._incumbent
         if not incumbent or self._any_unready and not all(self._is_ready(self._step(t)) for t in incumbent):
             return self._promising(price)
-        exploring = self._total.explored <= self._allowed_to_explore
+        exploring = self._total.explored < self._allowed_to_explore
         if exploring or self._states is None:
             path = self._promising(price)
             if exploring and path != incumbent:
@@ -910,7 +919,9 @@ class Tree(_Records):
         total, batches = self._total, EXPLORATION * len(self._operators)
         if not total.batches:
             return 0.0
-        return batches * math.log1p(total.batches / batches) * total.spent / total.batches
+        # After a warm start as little from the beginning as at the end of the earlier runs.
+        units = math.log1p(total.batches / (self._earlier_batches + batches))
+        return batches * units * total.spent / total.batches
 
     def _spend(self, history: _History, seconds: float, is_first_trial: bool) -> None:
         if self._incumbent:
@@ -920,9 +931,13 @@ class Tree(_Records):
             self._total.explored += seconds * (history not in self._of_incumbent)
 
     def _renew_incumbent(self) -> None:
-        """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more."""
+        """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more; after a warm
+        start of all, until one was."""
         if self.reward != "rate":
             return
+        if not self._incumbent and self._earlier_batches:
+            for path in self._prefixes.get(self.transitions.full, []):
+                self._incumbent, self._of_incumbent = path, frozenset(self._made_along(path)[1])
         rates = [(self._rate_of(path), path) for path in self._finished_paths()]
         rate, path = max(rates, default=(0.0, ()), key=lambda pair: pair[0])
         if path and (not self._incumbent or rate > CLEARLY_MORE * self._rate_of(self._incumbent)):
@@ -932,7 +947,8 @@ class Tree(_Records):
     def _curious(self) -> bool:
         if self._states is None or self._choices % CURIOUS_EVERY:
             return False
-        return self._total.first_trials <= CURIOSITY * self._total.spent
+        at_once = not self._earlier_batches
+        return self._total.first_trials + (0.0 if at_once else TRIAL_SECONDS) <= CURIOSITY * self._total.spent
 
     def _path_to_untried(self) -> Path:
         """A sequence with an operator that never ran: the smallest one after the cheapest prefix; () where all have run.
@@ -1240,6 +1256,7 @@ class Tree(_Records):
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
+        self._earlier_batches = sum(data["totals"]["batches"] for data in earlier)
         self._stale = True
 
     @classmethod

@@ -405,6 +405,27 @@ def test_a_warm_start_carries_over_how_histories_compare():
     assert expected() == pytest.approx(pooled * 400 / 300, rel=0.02)
 
 
+def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails_here():
+    """a then b: 25 samples/s there, b then a and (a,b) a tenth. Run from the first choice on, and left once it makes nothing."""
+    transitions = pair_graph()
+    best, rest = transitions.parse("a; b"), [transitions.parse(text) for text in ("b; a", "(a,b)")]
+    earlier = Tree(transitions)
+    for _ in range(200):
+        earlier.record((), best[0], 100, 50, 1.0)
+        earlier.record(best[:1], best[1], 50, 50, 1.0)
+        earlier.record((), rest[0][0], 100, 5, 1.0)
+        earlier.record(rest[0][:1], rest[0][1], 5, 5, 1.0)
+        earlier.record((), rest[1][0], 100, 3, 1.0)
+    warm = Tree(transitions)
+    warm.warm_start([earlier.as_json()], n_equiv=5)
+    assert [warm.select() for _ in range(10)] == [best] * 10
+    assert warm.incumbent == best
+    for _ in range(20):
+        warm.record((), best[0], 100, 50, 1.0)
+        warm.record(best[:1], best[1], 50, 0, 1.0)
+    assert best not in [warm.select() for _ in range(10)]
+
+
 def test_the_incumbent_is_run_while_others_promise_little_more():
     """Two sequences of nearly equal rates, after many batches: one of them is run nearly always, and each has been run."""
     transitions = pair_graph()
