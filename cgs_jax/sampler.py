@@ -286,11 +286,19 @@ def _squared_unknowns(operator: Operator) -> int:
     return max(operator.plan.layout.unknowns, LEAST_UNKNOWNS) ** 2
 
 
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """Somebody waits for a member of the crew, if possible one that has the programs of an operator."""
+
+    operator: Operator | None
+
+
 class _Crew:
     """Who runs batches: worker processes where the problem can be loaded there, and this process until they have arrived."""
 
     def __init__(self, runner: BatchRunner, workers: int, setup: Setup | None) -> None:
         self._free: list[BatchRunner | Worker] = []
+        self._line: list[_Request] = []
         self._changed = threading.Condition()
         self._wanted = workers
         self._arrived: list[Worker] = []
@@ -313,19 +321,28 @@ class _Crew:
         self._release(member)
 
     def _take(self, operator: Operator | None = None) -> BatchRunner | Worker:
-        """Whoever is free next; if some worker has the programs of an operator, one of those."""
+        """Whoever is free next; if some worker has the programs of an operator, one of those. First come, first served."""
+        request = _Request(operator)
         with self._changed:
+            self._line.append(request)
             while True:
                 # With all workers there, this process has its core for compiling and deciding.
                 if self._complete() and self._local in self._free:
                     self._free.remove(self._local)
-                able = [member for member in self._arrived if operator is not None and self._has(member, operator)]
                 # The last one first: where not all are needed the others do not have to read programs.
                 for member in reversed(self._free):
-                    if not able or member in able:
+                    if next((r for r in self._line if self._suits(r, member)), None) is request:
+                        self._line.remove(request)
                         self._free.remove(member)
+                        self._changed.notify_all()
                         return member
                 self._changed.wait()
+
+    def _suits(self, request: _Request, member: BatchRunner | Worker) -> bool:
+        if request.operator is None:
+            return True
+        able = [worker for worker in self._arrived if self._has(worker, request.operator)]
+        return not able or member in able
 
     def _release(self, member: BatchRunner | Worker) -> None:
         with self._changed:
@@ -663,7 +680,8 @@ class Sampler:
         job = self._job_of(path)
         # Before the first look at a step is over, a second one would tell the same.
         if job is None:
-            job = self._job_of(self._steady) if self._steady else None
+            known = self._steady or getattr(self.chooser, "incumbent", ())
+            job = self._job_of(known) if known else None
         return job or self._job_of(path, again=True)
 
     def _job_of(self, path: Path, again: bool = False) -> _Job | None:
@@ -673,6 +691,7 @@ class Sampler:
         ends = (steps[-1].makes, *self._final_histories(path))
         position = makers[min(ends, key=lambda history: self._pool(history).size)]
         batch = self.settings.batch_size
+        known = getattr(self.chooser, "incumbent", ())
         while True:
             step = steps[position]
             slot = step.makes
@@ -681,7 +700,7 @@ class Sampler:
             visits = self._visits.get(slot, 0)
             young = visits < 2
             most = self._pace.affordable(step.operator)
-            if visits < LOOKS:
+            if visits < LOOKS and path != known:
                 most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.
             enough = max(most // (2 if visits else 8), 1)
