@@ -112,6 +112,7 @@ class BatchRunner:
         self._keyframes = Keyframes(self.problem)
         self._seed = seed
         self._numbers: dict[Any, Any] = {}
+        self._blanks: dict[int, np.ndarray] = {}
         self._requested: dict[int, list[Future]] = {}
         self._distinct: dict[int, Future] = {}  # operators share programs
         self._aimed: dict[int, AimedTables] = self.problem.aimed
@@ -231,6 +232,19 @@ class BatchRunner:
 
     # -------------------------------------------------------------- running
 
+    def _given(self, operator: Operator, padded: Values) -> np.ndarray:
+        """As `gather_given`: most of it is the same in all batches and only copied."""
+        params, room = self.problem.params, self.settings.batch_size
+        if any(term.kind == "chain" for term in operator.plan.given):
+            return gather_given(operator, params, padded, room)
+        if operator.identity not in self._blanks:
+            self._blanks[operator.identity] = gather_given(operator, params, padded, room)
+        given = self._blanks[operator.identity].copy()
+        for at, term in enumerate(operator.plan.given):
+            if term.kind == "pose":
+                given[:, at] = padded[term.name]
+        return given
+
     def run(self, batch: Batch) -> Outcome:
         """Runs one batch. Waits for its programs."""
         operator, problem = operator_of(self.problem, batch.transition), self.problem
@@ -239,7 +253,7 @@ class BatchRunner:
         began = time.perf_counter()
         count, room = batch.tasks, self.settings.batch_size
         padded = {name: _fill(batch.conditions[name], room) for name in operator.condition}
-        given = gather_given(operator, problem.params, padded, room)
+        given = self._given(operator, padded)
         of_function = tuple(padded[name] for name in operator.plan.given_configurations)
         key, numbers = self._key_of(operator), self._numbers_of(operator)
         device = -time.perf_counter()
@@ -267,8 +281,7 @@ class BatchRunner:
                 failures[operator.measured[at]] = int(times)
         success = np.flatnonzero(rows_hold)
         proposed = len(success)
-        new = {name: value[success] for name, value in named.items()}
-        values = {name: value[success] for name, value in batch.conditions.items()} | new
+        values = _rows(batch.conditions, success) | _rows(named, success)
         for position, clear in enumerate(operator.clears, start=1):
             if not len(success):
                 break
@@ -281,8 +294,8 @@ class BatchRunner:
             clears = np.asarray(distance)[: len(success)] >= -PENETRATION
             if not clears.all():
                 failures[clear.constraint] = failures.get(clear.constraint, 0) + int((~clears).sum())
-                success = success[clears]
-                values = {name: value[clears] for name, value in values.items()}
+                kept = np.flatnonzero(clears)
+                success, values = success[kept], _rows(values, kept)
         mask = np.zeros(count, bool)
         mask[success] = True
         host = max(time.perf_counter() - began - device, 0.0)
@@ -296,6 +309,10 @@ class BatchRunner:
         qpos = self._keyframes.qpos(values)
         result = self.auditor.check(qpos, values)
         return Audited(result.ok, qpos, result.violation, time.perf_counter() - began)
+
+
+def _rows(values: Mapping[str, np.ndarray], rows: np.ndarray) -> Values:
+    return {name: value.take(rows, axis=0) for name, value in values.items()}
 
 
 def _fill(value: np.ndarray, rows: int) -> np.ndarray:

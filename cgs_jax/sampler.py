@@ -205,7 +205,7 @@ REPRESENTATIVE = 128
 AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
-AUDIT_BATCHES = 12
+AUDIT_BATCHES = 24
 """Batches after which full samples are audited, however few there are."""
 
 TRIES = 0
@@ -767,9 +767,10 @@ class Sampler:
             given_up &= job.tries + 1 >= min(self.settings.tries, worthwhile)
             again = ~success & ~given_up
             if again.any():
-                part = {name: value[again] for name, value in job.batch.conditions.items()}
+                rows = np.flatnonzero(again)
+                part = {name: value.take(rows, axis=0) for name, value in job.batch.conditions.items()}
                 waiting = self._waiting[job.step.makes]
-                waiting.put(part | {TRIES: job.tries[again] + 1})
+                waiting.put(part | {TRIES: job.tries[rows] + 1})
         operator = job.step.operator
         seconds = self._pace.seconds(operator, len(success), outcome.iterations, outcome.device_seconds, job.look)
         allowed = self.settings.tries if job.step.reads else 1
