@@ -43,11 +43,14 @@ class Keyframes:
         values = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
         count = len(next(iter(values.values())))
         result = np.tile(self._home, (count, len(self._switches), 1))
+        known: dict[Product, np.ndarray] = {}  # an object rests at several switches
         for k in range(len(self._switches)):
             for variable, addresses in self._configurations[k]:
                 result[:, k, addresses] = values[variable]
             for product, address in self._poses[k]:
-                result[:, k, address : address + 7] = self._pose(product, values)
+                if product not in known:
+                    known[product] = self._pose(product, values)
+                result[:, k, address : address + 7] = known[product]
         return result
 
     def _pose(self, product: Product, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -56,21 +59,23 @@ class Keyframes:
             name = product[0].name
             vector = self._problem.exact.constants[name] if product[0].kind == "constant" else values[name]
             return np.concatenate([vector[..., :3], _unit(vector[..., 3:])], axis=-1)
-        rotation, position = np.eye(3)[None], np.zeros((1, 3))
+        # The batch last, so that products run along whole rows.
+        rotation, position = np.eye(3)[..., None], np.zeros((3, 1))
         for term in product:
             if term.kind == "chain":
                 assert term.variable is not None
-                turn, move = tool_poses_on_host(self._problem.exact.chains[term.name], values[term.variable])
+                turns, moves = tool_poses_on_host(self._problem.exact.chains[term.name], values[term.variable])
+                turn, move = np.moveaxis(turns, 0, 2), moves.T
             else:
                 vector = self._problem.exact.constants[term.name] if term.kind == "constant" else values[term.name]
                 vector = np.atleast_2d(vector)
-                turn, move = _rotation(_unit(vector[:, 3:])), vector[:, :3]
+                turn, move = _rotation(_unit(vector[:, 3:])), vector[:, :3].T
             if term.inverted:
-                turn = np.swapaxes(turn, 1, 2)
-                move = -(turn @ move[..., None])[..., 0]
-            position = position + (rotation @ move[..., None])[..., 0]
-            rotation = rotation @ turn
-        return np.concatenate([position, _quaternion(rotation)], axis=1)
+                turn = np.swapaxes(turn, 0, 1)
+                move = -np.einsum("ijb,jb->ib", turn, move)
+            position = position + np.einsum("ijb,jb->ib", rotation, move)
+            rotation = np.einsum("ijb,jkb->ikb", rotation, turn)
+        return np.concatenate([position.T, _quaternion(rotation)], axis=1)
 
 
 def _unit(quat: np.ndarray) -> np.ndarray:
@@ -78,18 +83,18 @@ def _unit(quat: np.ndarray) -> np.ndarray:
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:
+    """Rotations `(3, 3, N)` of unit quaternions `(N, 4)`."""
     w, x, y, z = quat.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return np.array(rows)
 
 
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternions `(N, 4)` of `(N, 3, 3)`: the best conditioned row of `4 q q^T`."""
-    r = np.moveaxis(rotation, 0, 2)
+def _quaternion(r: np.ndarray) -> np.ndarray:
+    """Unit quaternions `(N, 4)` of `(3, 3, N)`: the best conditioned row of `4 q q^T`."""
     rows = np.array(
         [
             [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],

@@ -205,7 +205,7 @@ REPRESENTATIVE = 128
 AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
-AUDIT_BATCHES = 24
+AUDIT_BATCHES = 32
 """Batches after which full samples are audited, however few there are."""
 
 TRIES = 0
