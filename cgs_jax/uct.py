@@ -93,7 +93,7 @@ CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
 TRIAL_SECONDS = 0.1
-"""What a first trial takes a worker, with the reading of programs: after a warm start as much must have been saved up for it."""
+"""What a first trial takes a worker, with the reading of programs: after a warm start so much must have been saved for it."""
 
 CURIOUS_AFTER = 30
 """Batches per operator of the graph, after which those that seem hopeless by what they cost have a first trial too."""

@@ -246,6 +246,9 @@ def _loaded(data: bytes) -> Program | None:
 
 def main() -> None:
     """Serves standard input until it ends, or until nobody reads the answers."""
+    # The process that decides and compiles comes first: all wait for it.
+    if hasattr(os, "nice"):
+        os.nice(3)
     # Ctrl-C reaches the whole group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sink = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
