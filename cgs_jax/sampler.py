@@ -13,7 +13,6 @@ process; all decisions are made by the one scheduling thread.
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import time
@@ -25,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from cgs_jax import programs
 from cgs_jax.audit import Tolerances
 from cgs_jax.augmented_lagrangian import Settings
 from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
@@ -202,6 +200,12 @@ LEAST_UNKNOWNS = 7
 REPRESENTATIVE = 128
 """Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
 
+BEFORE_COMPILER = 10.0
+"""Seconds of sampling for which workers and compiler share the cores as equals: samples are wanted soon, most of all."""
+
+NICENESS = 10
+"""Of the workers from then on, while programs are missing."""
+
 AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
@@ -306,6 +310,7 @@ class _Crew:
         self._refusal: Exception | None = None
         self.size = 0
         """Batches that can run at once now."""
+        self.niceness = 0
         self._workers: list[Worker] = []
         if setup is None:
             for _ in range(workers):
@@ -329,8 +334,7 @@ class _Crew:
                 # With all workers there, this process has its core for compiling and deciding.
                 if self._complete() and self._local in self._free:
                     self._free.remove(self._local)
-                # The last one first: where not all are needed the others do not have to read programs.
-                for member in reversed(self._free):
+                for member in self._free:
                     if next((r for r in self._line if self._suits(r, member)), None) is request:
                         self._line.remove(request)
                         self._free.remove(member)
@@ -407,8 +411,16 @@ class _Crew:
         if isinstance(member, Worker) and not self._local.is_aimed(operator):
             self._local.take_aimed(operator.identity, member.aim(transition))
 
+    def stand_back(self, niceness: int) -> None:
+        """Sets the priority of the workers, 0 the usual one, which it may not be allowed to go back to."""
+        self.niceness = niceness
+        for worker in self._workers:
+            worker.stand_back(niceness)
+
     def close(self) -> None:
         """Ends the worker processes, but for those that have arrived and wait: the next run takes them. No batch may run."""
+        if self.niceness:
+            self.stand_back(0)
         for worker in self._workers:
             if worker in self._arrived:
                 dismiss(worker)
@@ -540,7 +552,10 @@ class Sampler:
                 if num_samples is not None and found >= num_samples:
                     reason = "samples"
                     break
-                most = self._most_in_flight(crew)
+                # What is decided must not depend on when the workers arrive.
+                # More than run at once wait, so that no worker does.
+                most = self.settings.workers if self.settings.deterministic else crew.size + 2
+                self._stand_back(crew, elapsed)
                 while len(in_flight) < most:
                     work: _Job | list[_Candidates] | None
                     if self._audit_due(found, num_samples):
@@ -585,16 +600,11 @@ class Sampler:
             crew.close()
         yield Finished(reason, clock() - start)
 
-    def _most_in_flight(self, crew: _Crew) -> int:
-        """Batches in flight from now on; in a deterministic run always the same."""
-        if self.settings.deterministic:
-            return self.settings.workers
-        # What a search may choose is worth more than what it makes meanwhile: cores for the compiler come first.
-        beside_compiler = max((os.cpu_count() or 1) - programs.THREADS, 1)
-        if beside_compiler < self.settings.workers and not self._all_ready():
-            return beside_compiler
-        # More than run at once wait, so that no worker does.
-        return crew.size + 2
+    def _stand_back(self, crew: _Crew, elapsed: float) -> None:
+        """Lets the compiler go before the workers where it takes long: what the search may choose must become complete."""
+        niceness = NICENESS if elapsed > BEFORE_COMPILER and not self._all_ready() else 0
+        if niceness != crew.niceness:
+            crew.stand_back(niceness)
 
     def _crew(self) -> _Crew:
         source, workers = self.problem.source, self.settings.workers

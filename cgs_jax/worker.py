@@ -154,6 +154,12 @@ class Worker:
             raise answer
         return answer
 
+    def stand_back(self, niceness: int) -> None:
+        """Sets the priority of the process, 0 the usual one. Does nothing where that is not allowed or not known."""
+        if hasattr(os, "setpriority"):
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, niceness)
+
     def close(self) -> None:
         """Ends the process."""
         self._process.kill()
@@ -246,9 +252,6 @@ def _loaded(data: bytes) -> Program | None:
 
 def main() -> None:
     """Serves standard input until it ends, or until nobody reads the answers."""
-    # The process that decides and compiles comes first: all wait for it.
-    if hasattr(os, "nice"):
-        os.nice(3)
     # Ctrl-C reaches the whole group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sink = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
