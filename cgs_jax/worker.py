@@ -197,6 +197,12 @@ def dismiss(worker: Worker) -> None:
         worker.close()
 
 
+def end_idle() -> None:
+    """Ends the workers that wait for another run."""
+    while _idle:
+        _idle.pop().close()
+
+
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
     """Answers messages until the source ends."""
 

@@ -760,7 +760,10 @@ def peak_flops(size: int = 2048, seconds: float = 1.0) -> float:
 
 
 def peak_memory() -> dict[str, int]:
-    """Largest resident size so far, bytes: of this process, and of the largest process that it started and that ended."""
+    """Largest resident size so far, bytes: of this process, and of the largest worker, for which they are all ended."""
+    from cgs_jax.worker import end_idle
+
+    end_idle()
     unit = 1 if sys.platform == "darwin" else 1024
     who = {"process": resource.RUSAGE_SELF, "largest_worker": resource.RUSAGE_CHILDREN}
     return {name: unit * resource.getrusage(whose).ru_maxrss for name, whose in who.items()}
