@@ -251,22 +251,22 @@ class Projection(NamedTuple):
     feasible: jax.Array  # (lanes,) bool: every row within the tolerance
     violation: jax.Array  # (lanes,) largest row violation
     iterations: jax.Array  # (lanes,) int32
-
-
-def _outcome(state: State, settings: Settings) -> Projection:
-    return Projection(state.x, state.violation <= settings.tolerance, state.violation, state.iteration)
+    executed: jax.Array  # () int32: iterations that all lanes together went through, those that were done included
 
 
 def project(system: System, x: PyTree, data: PyTree, settings: Settings) -> Projection:
     """Projects every lane's seed; runs until all lanes have finished."""
 
-    def body(state: State) -> State:
+    def body(carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        state, rounds = carry
         checked = state.residual
         state = lax.fori_loop(0, settings.check_period, lambda _, s: step(system, s, data, settings), state)
-        return state._replace(checked=checked)
+        return state._replace(checked=checked), rounds + 1
 
-    state = lax.while_loop(lambda s: ~jnp.all(finished(s, settings)), body, init(system, x, data, settings))
-    return _outcome(state, settings)
+    start = init(system, x, data, settings), jnp.zeros((), jnp.int32)
+    state, rounds = lax.while_loop(lambda carry: ~jnp.all(finished(carry[0], settings)), body, start)
+    executed = rounds * settings.check_period * state.violation.shape[0]
+    return Projection(state.x, state.violation <= settings.tolerance, state.violation, state.iteration, executed)
 
 
 class _Packing:
@@ -312,13 +312,13 @@ def project_queue(
     blank = init(system, points.unpack(start_x), (packing.unpack(start_tasks), shared), settings)
     # Per task: the point, the violation, the iterations.
     results = jnp.concatenate([seed_rows, jnp.full((total, 1), jnp.inf), jnp.zeros((total, 1))], axis=1)
-    Carry = tuple[State, jax.Array, jax.Array, jax.Array, jax.Array]
+    Carry = tuple[State, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 
     def busy(carry: Carry) -> jax.Array:
         return jnp.any(carry[2] < count)
 
     def body(carry: Carry) -> Carry:
-        state, lane_tasks, ids, following, results = carry
+        state, lane_tasks, ids, following, results, rounds = carry
         data = (packing.unpack(lane_tasks), shared)
         checked = state.residual
         state = lax.fori_loop(0, settings.check_period, lambda _, s: step(system, s, data, settings), state)
@@ -343,13 +343,17 @@ def project_queue(
         moved = jnp.sum(done, dtype=jnp.int32)
         x, lane_tasks, ids, results = lax.fori_loop(0, moved, exchange, (outcome[:size], lane_tasks, ids, results))
         fresh = {n: jnp.where(done, getattr(blank, n), getattr(state, n)) for n in State._fields if n != "x"}
-        return State(x=points.unpack(x), **fresh), lane_tasks, ids, following + moved, results
+        return State(x=points.unpack(x), **fresh), lane_tasks, ids, following + moved, results, rounds + 1
 
-    carry = (blank, start_tasks, first, jnp.asarray(lanes, jnp.int32), results)
-    results = lax.while_loop(busy, body, carry)[4]
+    carry = (blank, start_tasks, first, jnp.asarray(lanes, jnp.int32), results, jnp.zeros((), jnp.int32))
+    *_, results, rounds = lax.while_loop(busy, body, carry)
     violation = results[:, size]
     return Projection(
-        points.unpack(results[:, :size].T), violation <= settings.tolerance, violation, results[:, size + 1].astype(jnp.int32)
+        x=points.unpack(results[:, :size].T),
+        feasible=violation <= settings.tolerance,
+        violation=violation,
+        iterations=results[:, size + 1].astype(jnp.int32),
+        executed=rounds * settings.check_period * lanes,
     )
 
 

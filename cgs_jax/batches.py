@@ -74,6 +74,8 @@ class Outcome:
     proposed: int
     """Tasks whose rows were solved."""
     iterations: int
+    executed: int
+    """Iterations that all lanes together went through: idle ones and those of finished tasks included."""
     failures: Mapping[str, int]
     """Tasks stopped by each constraint; a task that violates several rows counts for the worst."""
     device_seconds: float
@@ -301,7 +303,8 @@ class BatchRunner:
         host = max(time.perf_counter() - began - device, 0.0)
         if self.settings.counted_time:
             device = WORK_SECONDS * (count + iterations) * (1 + operator.plan.layout.unknowns)
-        return Outcome(values, mask, proposed, iterations, failures, device, host, began - asked)
+        executed = int(result.executed)
+        return Outcome(values, mask, proposed, iterations, executed, failures, device, host, began - asked)
 
     def audit(self, values: Values) -> Audited:
         """Keyframes and audit of full samples."""

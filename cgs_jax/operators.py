@@ -63,6 +63,7 @@ class Proposals(NamedTuple):
     feasible: jax.Array  # (tasks,) all rows within the tolerance, evaluated anew after the solver
     violation: jax.Array  # (constraints, tasks) largest row violation, m or rad; 0 for constraints without rows
     iterations: jax.Array  # (tasks,)
+    executed: jax.Array  # () iterations that all lanes together went through
 
 
 def _chunked(function: Callable, count: jax.Array | int, total: int, size: int, inputs: PyTree, blank: PyTree) -> PyTree:
@@ -126,9 +127,9 @@ def propose(
     system = PlanSystem(layout)
     if layout.solves:
         projection = al.project_queue(system, seeds, task_data, shared, count, min(lanes, tasks), settings)
-        x, iterations = projection.x, projection.iterations
+        x, iterations, executed = projection.x, projection.iterations, projection.executed
     else:
-        x, iterations = seeds, jnp.zeros((tasks,), jnp.int32)
+        x, iterations, executed = seeds, jnp.zeros((tasks,), jnp.int32), jnp.zeros((), jnp.int32)
     if refine is not None:
         x = refine(x, task_data, shared)
 
@@ -147,6 +148,7 @@ def propose(
         feasible=feasible,
         violation=violation,
         iterations=iterations,
+        executed=executed,
     )
 
 

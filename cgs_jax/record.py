@@ -33,6 +33,7 @@ class OperatorRecord:
     proposed: int = 0
     cleared: int = 0
     iterations: int = 0
+    executed: int = 0
     device_seconds: float = 0.0
     first_tries: int = 0
     first_successes: int = 0
@@ -69,6 +70,7 @@ class OperatorRecord:
             "successes": self.cleared,
             "success_rate": self.success_rate,
             "iterations_per_task": self.iterations / max(self.tasks, 1),
+            "useful_share": self.iterations / self.executed if self.executed else None,
             "device_seconds": self.device_seconds,
             "microseconds_per_task": 1e6 * self.device_seconds / max(self.tasks, 1),
             "condition_feasible": None if causes is None else causes[0],
@@ -95,6 +97,7 @@ class Recorder:
         self.problem, self.chooser, self.method, self.seed = problem, chooser, method, seed
         self.settings, self.tolerances, self._columns = settings, auditor.tolerances, auditor.constraints
         self.operators: dict[str, OperatorRecord] = {}
+        self.transitions: dict[str, Transition] = {}  # one of each operator
         self.startup_seconds = self.compile_seconds = self.device_seconds = 0.0
         self.host_seconds = self.audit_seconds = self.elapsed = 0.0
         self.programs: list[tuple[str, float]] = []
@@ -124,20 +127,24 @@ class Recorder:
             self._final = self.meta()
 
     def _ran(self, event: Ran) -> None:
-        record = self.operators.setdefault(operator_text(event.path[event.position]), OperatorRecord())
+        transition = event.path[event.position]
+        name = operator_text(transition)
+        self.transitions.setdefault(name, transition)
+        record = self.operators.setdefault(name, OperatorRecord())
         record.calls += 1
-        for name in (
+        for counted in (
             "tasks",
             "proposed",
             "cleared",
             "iterations",
+            "executed",
             "device_seconds",
             "first_tries",
             "first_successes",
             "second_tries",
             "second_successes",
         ):
-            setattr(record, name, getattr(record, name) + getattr(event, name))
+            setattr(record, counted, getattr(record, counted) + getattr(event, counted))
         for name, times in event.failures.items():
             record.failures[name] = record.failures.get(name, 0) + times
         self.device_seconds += event.device_seconds
@@ -288,9 +295,9 @@ class Recorder:
         """Writes the statistics that the chooser gathered, for `load_tree`."""
         write_json(Path(path), self.chooser.as_json())
 
-    def save_profile(self, path: str | os.PathLike[str]) -> None:
-        """Writes `profile` as JSON."""
-        write_json(Path(path), self.profile())
+    def save_profile(self, path: str | os.PathLike[str], utilisation: Mapping[str, Any] | None = None) -> None:
+        """Writes `profile` as JSON, with what `utilisation.utilisation` says of the run."""
+        write_json(Path(path), {**self.profile(), "utilisation": utilisation})
 
 
 def operator_text(transition: Transition) -> str:

@@ -67,6 +67,8 @@ class Ran:
     cleared: int
     """Of these, tasks whose clearance held too."""
     iterations: int
+    executed: int
+    """Iterations that all lanes together went through."""
     failures: Mapping[str, int]
     """Tasks stopped by each constraint; a task that violates several rows counts for the worst."""
     first_tries: int
@@ -809,6 +811,7 @@ class Sampler:
             proposed=outcome.proposed,
             cleared=int(success.sum()),
             iterations=outcome.iterations,
+            executed=outcome.executed,
             failures=outcome.failures,
             first_tries=int(first.sum()),
             first_successes=int((first & success).sum()),

@@ -45,11 +45,9 @@ from cgs_jax.errors import InputError
 
 if TYPE_CHECKING:
     from cgs_jax.audit import Tolerances
-    from cgs_jax.operators import Operator
     from cgs_jax.problems import Problem
     from cgs_jax.record import Recorder
     from cgs_jax.sampler import SamplerSettings
-    from cgs_jax.transitions import Transition
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -95,8 +93,6 @@ class Measured:
     cpu_share: float
     """Processor time of this process and its workers from the window's begin to the run's end, over that time and cores."""
     record: Recorder
-    transitions: dict[str, Transition]
-    """By the operator's text in the record."""
 
 
 def measure(
@@ -109,23 +105,19 @@ def measure(
 ) -> Measured:
     """Runs a method until the end of the window (s of sampling time) and counts what passed the audit inside it."""
     from cgs_jax.api import make_chooser
-    from cgs_jax.record import Recorder, operator_text
-    from cgs_jax.sampler import Found, Ran, Sampler, SamplerSettings, Started
+    from cgs_jax.record import Recorder
+    from cgs_jax.sampler import Found, Sampler, SamplerSettings, Started
 
     settings = settings or SamplerSettings()
     chooser = make_chooser(problem, method, seed, pools=settings.pools)
     sampler = Sampler(problem, chooser, seed, settings, tolerances)
     record = Recorder(problem, chooser, method, seed, settings, sampler.auditor)
-    transitions: dict[str, Transition] = {}
     low, high = window
     found_inside, began, cpu = 0, 0.0, (0.0, 0.0)
     for event in sampler.events(high):
         record.listen(event)
         if isinstance(event, Started):
             began = time.perf_counter()
-        elif isinstance(event, Ran):
-            transition = event.path[event.position]
-            transitions.setdefault(operator_text(transition), transition)
         elif isinstance(event, Found) and low <= event.elapsed < high:
             found_inside += len(event.qpos)
         if began and not cpu[0] and time.perf_counter() - began >= low:
@@ -137,7 +129,6 @@ def measure(
         startup_seconds=record.startup_seconds,
         cpu_share=busy / max(wall * len(os.sched_getaffinity(0)), 1e-9) if cpu[0] else 0.0,
         record=record,
-        transitions=transitions,
     )
 
 
@@ -472,6 +463,8 @@ def utilisation(given: argparse.Namespace) -> dict[str, Any]:
     """Useful lane-iterations over all, and the solver's arithmetic over the machine's peak."""
     from cgs_jax import load_problem
     from cgs_jax.sampler import SamplerSettings
+    from cgs_jax.utilisation import seconds_per_lane_step
+    from cgs_jax.utilisation import utilisation as utilisation_of
 
     settings = SamplerSettings()
     report: dict[str, Any] = {
@@ -479,8 +472,7 @@ def utilisation(given: argparse.Namespace) -> dict[str, Any]:
             "float operations of the solver's step as written, counted by evaluating its jaxpr with loops followed; "
             "seeds, clearance and audit are not counted"
         ),
-        "peak_flops": peak_of_machine(),
-        "peak_from": "float32 matrix products 2048 x 2048, all cores, the faster of jax and numpy",
+        "peak_from": "float32 matrix products 2048 x 2048, all cores, the faster of jax and numpy, in the same run",
         "instance": given.instances[0],
         "scenes": {},
     }
@@ -489,274 +481,19 @@ def utilisation(given: argparse.Namespace) -> dict[str, Any]:
         warm_up(problem, given.method)
         measured = measure(problem, given.window, given.method, given.seed)
         record = measured.record
-        samples = record.samples()
-        rows, useful_total, all_total, flops_total = {}, 0.0, 0.0, 0.0
-        for name, entry in record.operators.items():
-            if not entry.iterations or entry.device_seconds < 0.01 * record.device_seconds:
-                continue
-            flops, step_seconds = lane_step(problem, measured.transitions[name], settings)
-            replayed = replay(problem, measured.transitions[name], samples.variables, settings)
-            if replayed is None:  # it reads a variable that no sample has a value of
-                continue
-            useful, executed = replayed
-            share = useful / executed
-            rows[name] = {
-                "flops_per_lane_step": flops,
-                "useful_share": share,
-                "iterations": entry.iterations,
-                "iterations_per_task": entry.iterations / entry.tasks,
-                "device_seconds": entry.device_seconds,
-                "achieved_flops": entry.iterations / share * flops / entry.device_seconds,
-                "microseconds_per_lane_step_alone": 1e6 * step_seconds,
-                "share_of_steps_in_device_time": entry.iterations / share * step_seconds / entry.device_seconds,
-            }
-            useful_total += entry.iterations
-            all_total += entry.iterations / share
-            flops_total += entry.iterations / share * flops
-        covered = sum(row["device_seconds"] for row in rows.values())
-        report["scenes"][scene] = {
-            "operators": rows,
-            "share_of_device_time_counted": covered / record.device_seconds if record.device_seconds else 0.0,
-            "useful_lane_iterations": useful_total,
-            "lane_iterations": all_total,
-            "useful_share": useful_total / all_total if all_total else 0.0,
-            "flops": flops_total / record.elapsed,
-            "useful_flops": flops_total / record.elapsed * (useful_total / all_total if all_total else 0.0),
-            "share_of_peak": flops_total / record.elapsed / report["peak_flops"],
+        entry = utilisation_of(record)
+        for name, row in entry["operators"].items():
+            seconds = seconds_per_lane_step(problem, record.transitions[name], settings)
+            row["microseconds_per_lane_step_alone"] = 1e6 * seconds
+            row["share_of_steps_in_device_time"] = row["iterations"] / row["useful_share"] * seconds / row["device_seconds"]
+        report["scenes"][scene] = entry | {
             "cpu_share": measured.cpu_share,
             "rate": measured.rate,
-            "flops_per_sample": flops_total / record.count if record.count else None,
             "shares_of_worker_time": record.profile()["shares_of_worker_time"],
             "peak_memory_bytes": peak_memory(),
         }
+    report["peak_flops"] = max(entry["peak_flops"] for entry in report["scenes"].values())
     return report
-
-
-def replay(
-    problem: Problem, transition: Transition, values: Mapping[str, np.ndarray], settings: SamplerSettings
-) -> tuple[int, int] | None:
-    """One full batch of an operator on conditions of finished samples: useful lane-iterations, and all that ran.
-
-    The queue refills a lane when it is looked at, so that the iterations of the tasks tell how long each lane was held.
-    None without values of what the operator reads.
-    """
-    import jax
-
-    from cgs_jax.operators import gather_given, operator_of, propose_program
-
-    operator = operator_of(problem, transition)
-    batch = settings.batch_size
-    read: dict[str, np.ndarray] = {}
-    for name in operator.condition:
-        if not len(values[name]):
-            return None
-        read[name] = np.resize(values[name].astype(np.float32), (batch, values[name].shape[1]))
-    given = gather_given(operator, problem.params, read, batch)
-    of_function = tuple(read[name] for name in operator.plan.given_configurations)
-    program = propose_program(operator.plan.layout, settings.solver, settings.lanes)
-    numbers = operator.numbers(problem.params)
-    found = program(jax.random.key(1), np.uint32(0), np.int32(batch), given, of_function, numbers)
-    iterations, solved = np.asarray(found.iterations), np.asarray(found.feasible)
-    s = settings.solver
-    return int(iterations.sum()), lane_steps(iterations, solved, settings.lanes, s.check_period)
-
-
-def lane_steps(iterations: np.ndarray, solved: np.ndarray, lanes: int, period: int) -> int:
-    """Lane-iterations that a queue executes for tasks (N,) in order, idle lanes and steps that move nothing included.
-
-    A solved task needs one more evaluation to be seen as such; all tasks are looked at every `period` iterations only.
-    """
-    held = -(-(iterations + solved) // period)  # periods that a task holds its lane
-    free_at = np.zeros(lanes, dtype=np.int64)
-    for periods in np.maximum(held, 1):
-        first = int(free_at.argmin())
-        free_at[first] += periods
-    return int(free_at.max()) * period * lanes
-
-
-def lane_step(problem: Problem, transition: Transition, settings: SamplerSettings) -> tuple[float, float]:
-    """Float operations of one solver iteration of one lane, and its seconds with nothing else beside it."""
-    import jax
-    import jax.numpy as jnp
-
-    from cgs_jax import augmented_lagrangian as al
-    from cgs_jax.operators import operator_of
-    from cgs_jax.plans import PlanSystem
-
-    operator = operator_of(problem, transition)
-    lanes = settings.lanes
-    x, tasks, shared = drawn(operator, problem, lanes)
-    system = PlanSystem(operator.plan.layout)
-    data = (tasks, shared)
-    state = al.init(system, x, data, settings.solver)
-    leaves, structure = jax.tree.flatten((state, data))
-    arrays = [jnp.asarray(leaf) for leaf in leaves]
-
-    def step(*parts: jax.Array) -> Any:
-        state, data = jax.tree.unflatten(structure, parts)
-        return al.step(system, state, data, settings.solver)
-
-    @jax.jit
-    def steps(count: jax.Array, state: Any, data: Any) -> Any:
-        return jax.lax.fori_loop(0, count, lambda _, s: al.step(system, s, data, settings.solver), state)
-
-    repeats, times = 50, []
-    for _ in range(6):
-        began = time.perf_counter()
-        jax.block_until_ready(steps(jnp.int32(repeats), state, data))
-        times.append(time.perf_counter() - began)
-    # The first call compiles; work that does not depend on the lane is shared by all of them.
-    return count_flops(step, *arrays) / lanes, min(times[1:]) / (repeats * lanes)
-
-
-def drawn(operator: Operator, problem: Problem, lanes: int) -> tuple[Any, Any, Any]:
-    """Seeds, task data and shared data of an operator, with identity poses as what it is given."""
-    import jax
-    import jax.numpy as jnp
-
-    from cgs_jax.poses import Pose, from_vector
-    from cgs_jax.seeds import count_draws, draw, uniforms
-
-    layout = operator.plan.layout
-    numbers = jax.tree.map(jnp.asarray, operator.numbers(problem.params))
-    identity = jnp.array([0, 0, 0, 1, 0, 0, 0], jnp.float32)
-    pose = from_vector(jnp.broadcast_to(identity[:, None, None], (7, layout.given, lanes)))
-    pose = Pose(jnp.moveaxis(pose.rotation, 2, 0), jnp.moveaxis(pose.position, 1, 0))
-    q = tuple(jnp.zeros((problem.dofs[name], lanes), jnp.float32) for name in operator.plan.given_configurations)
-    u = uniforms(jax.random.key(0), jnp.arange(lanes, dtype=jnp.uint32), count_draws(layout))
-    seeds, tasks = draw(layout, pose, q, numbers.tables, numbers.seeds, numbers.choices, numbers.shared, u)
-    return seeds, tasks, numbers.shared
-
-
-SINGLE_OPERATIONS = frozenset(
-    "add sub mul div max min neg abs sqrt rsqrt sin cos tan exp log log1p expm1 pow integer_pow atan2 asin acos atan tanh "
-    "square floor ceil round sign clamp select_n add_any".split()
-)
-"""Primitives counted as one operation per element of a float result."""
-
-REDUCTIONS = frozenset("reduce_sum reduce_max reduce_min reduce_prod cumsum cumprod argmax argmin".split())
-"""Primitives counted as one operation per element of a float argument."""
-
-
-def count_flops(function: Callable, *arguments: Any) -> int:
-    """Float operations of a jax function of arrays, as it is written: its jaxpr is walked, loops run their full length.
-
-    Only integers and truth values are computed on the way; they must decide how long loops run. A multiplication by a
-    constant zero counts; what the compiler then removes or repeats is unknown to this count. Raises TypeError where a float
-    decides about a loop or a branch.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    closed = jax.make_jaxpr(function)(*arguments)
-    total = 0
-
-    def run(jaxpr: Any, constants: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-        """The outputs; None for those that are not known."""
-        nonlocal total
-        known = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, values, strict=True))
-
-        def read(atom: Any) -> Any:
-            value = atom.val if hasattr(atom, "val") else known[atom]
-            return value if discrete(atom) else None
-
-        for equation in jaxpr.eqns:
-            inputs = [read(atom) for atom in equation.invars]
-            name, parameters = equation.primitive.name, equation.params
-            if name == "while":
-                outputs = loop(parameters, inputs)
-            elif name == "scan":
-                outputs = scan(parameters, inputs)
-            elif name == "cond":
-                if inputs[0] is None:
-                    raise TypeError("a float decides about a branch")
-                branch = parameters["branches"][int(inputs[0])]
-                outputs = run(branch.jaxpr, branch.consts, inputs[1:])
-            elif inner := next((parameters[key] for key in ("jaxpr", "call_jaxpr") if key in parameters), None):
-                outputs = run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs)
-            elif any(value is None for value in inputs) or not all(map(discrete, equation.outvars)):
-                outputs = [None] * len(equation.outvars)
-                total += operations(name, parameters, equation)
-            else:
-                outputs = equation.primitive.bind(*inputs, **parameters)
-                outputs = outputs if equation.primitive.multiple_results else [outputs]
-            known.update(zip(equation.outvars, outputs, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    def loop(parameters: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
-        test, body = parameters["cond_jaxpr"], parameters["body_jaxpr"]
-        first, second = parameters["cond_nconsts"], parameters["body_nconsts"]
-        of_test, of_body, carry = inputs[:first], inputs[first : first + second], inputs[first + second :]
-        while True:
-            (goes_on,) = run(test.jaxpr, test.consts, [*of_test, *carry])
-            if goes_on is None:
-                raise TypeError("a float decides how long a loop runs")
-            if not goes_on:
-                return carry
-            carry = run(body.jaxpr, body.consts, [*of_body, *carry])
-
-    def scan(parameters: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
-        body, fixed, carried = parameters["jaxpr"], parameters["num_consts"], parameters["num_carry"]
-        constants, carry, rows = inputs[:fixed], inputs[fixed : fixed + carried], inputs[fixed + carried :]
-        turns = range(parameters["length"])
-        stacked: list[list[Any]] = [[] for _ in body.jaxpr.outvars[carried:]]
-        for i in reversed(turns) if parameters["reverse"] else turns:
-            outputs = run(body.jaxpr, body.consts, [*constants, *carry, *(None if row is None else row[i] for row in rows)])
-            carry = outputs[:carried]
-            for parts, output in zip(stacked, outputs[carried:], strict=True):
-                parts.insert(0 if parameters["reverse"] else len(parts), output)
-        whole = [None if any(part is None for part in parts) else jnp.stack(parts) for parts in stacked]
-        return [*carry, *whole]
-
-    run(closed.jaxpr, closed.consts, arguments)
-    return total
-
-
-def discrete(variable: Any) -> bool:
-    """Whether a variable of a jaxpr holds integers or truth values."""
-    kind = getattr(variable.aval, "dtype", None)
-    return kind is not None and (np.issubdtype(kind, np.integer) or np.issubdtype(kind, np.bool_))
-
-
-def operations(name: str, parameters: Mapping[str, Any], equation: Any) -> int:
-    """Float operations of one equation of a jaxpr without loops."""
-    result = equation.outvars[0].aval if equation.outvars else None
-    if result is None or not np.issubdtype(getattr(result, "dtype", None), np.floating):
-        return 0
-    if name == "dot_general":
-        (contracted, _), _ = parameters["dimension_numbers"]
-        left = equation.invars[0].aval.shape
-        return 2 * int(np.prod(result.shape)) * int(np.prod([left[axis] for axis in contracted]))
-    if name in REDUCTIONS:
-        return int(np.prod(equation.invars[0].aval.shape))
-    return int(np.prod(result.shape)) if name in SINGLE_OPERATIONS else 0
-
-
-def peak_of_machine() -> float:
-    """`peak_flops` in a process of its own, which may use all cores whatever the sampler has set for itself."""
-    held = ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    environment = {name: value for name, value in os.environ.items() if name not in held}
-    command = [sys.executable, str(Path(__file__).resolve()), "--worker", "peak"]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout)
-
-
-def peak_flops(size: int = 2048, seconds: float = 1.0) -> float:
-    """Float operations per second of a plain float32 matrix product on all cores, the best of what jax and numpy reach."""
-    import jax
-    import jax.numpy as jnp
-
-    left = np.random.default_rng(0).normal(size=(size, size)).astype(np.float32)
-    on_device = jnp.asarray(left)
-    product = jax.jit(lambda a: a @ a)
-    best = 0.0
-    for multiply in (lambda: product(on_device).block_until_ready(), lambda: left @ left):
-        multiply()
-        until = time.perf_counter() + seconds
-        while time.perf_counter() < until:
-            began = time.perf_counter()
-            multiply()
-            best = max(best, 2.0 * size**3 / (time.perf_counter() - began))
-    return best
 
 
 def peak_memory() -> dict[str, int]:
@@ -1348,9 +1085,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Exit status 0, 1 when slower than `--against`, or 2 for bad input (one line)."""
     given = parse().parse_args(arguments)
     try:
-        if given.worker == "peak":
-            print(peak_flops())
-            return 0
         if given.worker:
             scene, _, instance = given.worker.rpartition(",")
             print(json.dumps(compile_while_sampling(scene, int(instance))))

@@ -22,7 +22,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -398,6 +398,11 @@ def clear(folder: Path) -> None:
 
 def write(record: Recorder, options: argparse.Namespace, folder: Path) -> SampleSet:
     """Writes all files; returns the samples that were kept."""
+    used = None
+    if options.profile:
+        from cgs_jax.utilisation import utilisation
+
+        used = utilisation(record)
     samples = record.samples()
     if options.diverse is not None:
         samples = samples.select(samples.diverse(options.diverse))
@@ -406,7 +411,7 @@ def write(record: Recorder, options: argparse.Namespace, folder: Path) -> Sample
         if options.save_tree:
             record.save_tree(options.save_tree)
         if options.profile:
-            record.save_profile(folder / "profile.json")
+            record.save_profile(folder / "profile.json", used)
     except OSError as error:
         raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
     return samples
@@ -435,7 +440,7 @@ def tell(record: Recorder, samples: SampleSet, options: argparse.Namespace, fold
         console = make_console()
         print_summary(console, record, samples)
         if options.profile:
-            print_profile(console, record)
+            print_profile(console, json.loads((folder / "profile.json").read_text(encoding="utf-8")))
         console.print(f"\nWritten to {folder}", soft_wrap=True)
     sys.stdout.flush()
     if not record.count:
@@ -515,11 +520,10 @@ def print_summary(console: Console, record: Recorder, samples: SampleSet) -> Non
         console.print(spread)
 
 
-def print_profile(console: Console, record: Recorder) -> None:
-    """Where the time went."""
-    profile = record.profile()
+def print_profile(console: Console, profile: Mapping[str, Any]) -> None:
+    """Where the time went, and how much of the machine was used."""
     operators = table("profile (new | given)", "calls", "tasks", "iterations/task", "success", "us/task", "device s", "share")
-    total = max(record.device_seconds, 1e-12)
+    total = max(sum(entry["device_seconds"] for entry in profile["operators"].values()), 1e-12)
     for name, entry in profile["operators"].items():
         operators.add_row(
             name,
@@ -538,6 +542,12 @@ def print_profile(console: Console, record: Recorder) -> None:
         shares.add_row(name, percent(share))
     console.print()
     console.print(shares)
+    used = profile["utilisation"]
+    console.print(
+        f"\nuseful lane-iterations {percent(used['useful_share'])}; {used['flops'] / 1e9:.1f} GFLOP/s, "
+        f"{percent(used['share_of_peak'])} of the {used['peak_flops'] / 1e9:.0f} GFLOP/s of a matrix product now",
+        soft_wrap=True,
+    )
     programs = table("programs", "s to compile or load")
     for program in sorted(profile["programs"], key=lambda entry: -entry["seconds"]):
         programs.add_row(program["name"], f"{program['seconds']:.2f}")

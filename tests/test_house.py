@@ -71,6 +71,9 @@ MAY_IMPORT = {
         "errors", "audit", "constraints", "kinematics", "operators", "plans", "poses", "problems", "scene", "transitions",
     },
     "record": {"audit", "coverage", "diagram", "problems", "sampler", "samples", "scene", "transitions", "uct"},
+    "utilisation": {
+        "augmented_lagrangian", "operators", "plans", "poses", "problems", "record", "sampler", "seeds", "transitions",
+    },
     "api": {
         "errors", "audit", "augmented_lagrangian", "costs", "coverage", "operators", "plans", "poses", "problems", "record",
         "sampler", "samples", "transitions", "uct",
@@ -95,11 +98,11 @@ HOST = {
 # Modules that scripts may read names from, beside `cgs_jax` itself: the homes of the public names and what is loaded on demand.
 DOORS = {
     *cgs_jax._HOMES.values(),
-    *("coverage", "diagram", "experiments", "fitting", "record", "render", "report", "starter", "viewer"),
+    *("coverage", "diagram", "experiments", "fitting", "record", "render", "report", "starter", "utilisation", "viewer"),
 }
 
-# The benchmark also times the parts apart.
-MEASURES_PARTS = {"benchmark": {"augmented_lagrangian", "operators", "plans", "poses", "seeds", "transitions"}}
+# The benchmark also asks the workers for their memory.
+MEASURES_PARTS = {"benchmark": {"worker"}}
 
 
 @cache

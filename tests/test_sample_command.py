@@ -125,6 +125,8 @@ def test_one_json_object_and_nothing_else_on_stdout(tmp_path):
     profile = json.loads((out / "profile.json").read_text())
     assert set(profile["operators"]) == {"t", "q1 | t", "q2 | t"}
     assert all(entry["calls"] > 0 and entry["microseconds_per_task"] > 0 for entry in profile["operators"].values())
+    used = profile["utilisation"]
+    assert 0.0 < used["useful_share"] < 1.0 and 0.0 < used["share_of_peak"] < 0.5 and used["peak_flops"] > 1e9
 
     warm = start(
         "--scene", "pick_place", "--method", "tree-warm", "--warm-start", tree, "--warm-start", out / "tree.json",

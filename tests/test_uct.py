@@ -406,7 +406,7 @@ def test_a_warm_start_carries_over_how_histories_compare():
 
 
 def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails_here():
-    """a then b: 25 samples/s there, b then a and (a,b) a tenth. Run from the first choice on, and left once it makes nothing."""
+    """a then b: 25 samples/s there, others a tenth. Run from the first choice on, and left once it makes nothing here."""
     transitions = pair_graph()
     best, rest = transitions.parse("a; b"), [transitions.parse(text) for text in ("b; a", "(a,b)")]
     earlier = Tree(transitions)
