@@ -295,7 +295,7 @@ class Recorder:
         """Writes the statistics that the chooser gathered, for `load_tree`."""
         write_json(Path(path), self.chooser.as_json())
 
-    def save_profile(self, path: str | os.PathLike[str], utilisation: Mapping[str, Any] | None = None) -> None:
+    def save_profile(self, path: str | os.PathLike[str], utilisation: Mapping[str, Any]) -> None:
         """Writes `profile` as JSON, with what `utilisation.utilisation` says of the run."""
         write_json(Path(path), {**self.profile(), "utilisation": utilisation})
 

@@ -1256,7 +1256,7 @@ class Tree(_Records):
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
-        self._earlier_batches = sum(data["totals"]["batches"] for data in earlier)
+        self._earlier_batches = sum(data["totals"].get("batches", 0.0) for data in earlier)
         self._stale = True
 
     @classmethod

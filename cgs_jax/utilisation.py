@@ -231,7 +231,9 @@ def peak_of_machine() -> float:
     environment = {name: value for name, value in os.environ.items() if name not in held}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     command = [sys.executable, "-c", "from cgs_jax.utilisation import peak_flops; print(peak_flops())"]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout)
+    # Ctrl-C is for this process, which finishes its files first.
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, start_new_session=True)
+    return float(done.stdout)
 
 
 def peak_flops(size: int = 2048, seconds: float = 1.0) -> float:

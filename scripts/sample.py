@@ -398,11 +398,6 @@ def clear(folder: Path) -> None:
 
 def write(record: Recorder, options: argparse.Namespace, folder: Path) -> SampleSet:
     """Writes all files; returns the samples that were kept."""
-    used = None
-    if options.profile:
-        from cgs_jax.utilisation import utilisation
-
-        used = utilisation(record)
     samples = record.samples()
     if options.diverse is not None:
         samples = samples.select(samples.diverse(options.diverse))
@@ -411,7 +406,10 @@ def write(record: Recorder, options: argparse.Namespace, folder: Path) -> Sample
         if options.save_tree:
             record.save_tree(options.save_tree)
         if options.profile:
-            record.save_profile(folder / "profile.json", used)
+            from cgs_jax.utilisation import utilisation
+
+            # After the samples: it takes seconds.
+            record.save_profile(folder / "profile.json", utilisation(record))
     except OSError as error:
         raise InputError(f"cannot write to {folder}: {error.strerror or error}") from None
     return samples

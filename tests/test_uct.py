@@ -424,6 +424,9 @@ def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails
         warm.record((), best[0], 100, 50, 1.0)
         warm.record(best[:1], best[1], 50, 0, 1.0)
     assert best not in [warm.select() for _ in range(10)]
+    old = earlier.as_json()
+    del old["totals"]["batches"]  # as files of an earlier version
+    Tree(transitions).warm_start([old], n_equiv=5)
 
 
 def test_the_incumbent_is_run_while_others_promise_little_more():
