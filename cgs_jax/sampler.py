@@ -183,8 +183,15 @@ BATCH_SECONDS = 0.04
 LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
+EXPLORED = 2
+"""Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much."""
+
 PATIENCE = 4
 """Batches that may be spent until the step after one that was looked at for the first time is looked at too."""
+
+FIRST_PURSUIT = 24
+"""Choices for which the first sequences are kept, until one was run to its end: samples are wanted soon, and what others promise
+more than it can be told from then on."""
 
 FEW_HISTORIES = 3
 """Only while that step's operator ran after fewer histories than this: the tree judges it by those alone."""
@@ -314,6 +321,7 @@ class _Crew:
         """Batches that can run at once now."""
         self.niceness = 0
         self._workers: list[Worker] = []
+        self._arrivals: list[threading.Thread] = []
         if setup is None:
             for _ in range(workers):
                 self._seat(runner)
@@ -371,7 +379,8 @@ class _Crew:
             except Exception as error:  # noqa: BLE001 - raised by the next batch
                 self._refusal = error
 
-        threading.Thread(target=arrive, daemon=True).start()
+        self._arrivals.append(threading.Thread(target=arrive, daemon=True))
+        self._arrivals[-1].start()
 
     def run(self, batch: Batch, look: bool) -> Outcome:
         """Runs a batch on whoever is free; a first look at an operator, until the workers have arrived, here."""
@@ -390,12 +399,31 @@ class _Crew:
         member = self._take(operator if look else None)
         try:
             if isinstance(member, Worker):
-                self._aim(member, operator, batch.transition)
-                ready = [future.result() for future in self._local.request(operator)]
-                member.install(operator.identity, ready, self._local.aimed(operator))
+                self._equip(member, operator, batch.transition)
             return member.run(batch)
         finally:
             self._release(member)
+
+    def _equip(self, worker: Worker, operator: Operator, transition: Transition) -> None:
+        """Gives a worker the programs and seed tables of an operator."""
+        self._aim(worker, operator, transition)
+        ready = [future.result() for future in self._local.request(operator)]
+        worker.install(operator.identity, ready, self._local.aimed(operator))
+
+    def prepare(self, transitions: list[Transition]) -> None:
+        """Has this process and all workers read the programs of transitions, and makes their seed tables."""
+        for thread in self._arrivals:
+            thread.join()
+        if self._refusal is not None:
+            raise self._refusal
+        for transition in transitions:
+            operator = operator_of(self._local.problem, transition)
+            for worker in self._arrived:
+                self._equip(worker, operator, transition)
+            self._local.load(operator)
+            self._local.aimed(operator)
+        for worker in self._arrived:
+            worker.aim(transitions[0])  # which it answers when it has read everything
 
     def audit(self, values: Values) -> Audited:
         """Audits full samples on whoever is free."""
@@ -460,6 +488,8 @@ class Sampler:
         self._pace = _Pace(s.lanes, s.batch_size)
         self._made: defaultdict[int, set[History]] = defaultdict(set)  # by operator
         self._pursued: Path = ()
+        self._chosen_for = 0  # choices since then
+        self._ended = False  # whether some sequence was run to its end
         self._steady: Path = ()  # the last one that was no look
         self._looked_at: set[History] = set()  # now, in a first batch
         self._patience = 0
@@ -523,6 +553,21 @@ class Sampler:
         return tuple(dict.fromkeys(s.makes for s in steps if s.makes not in read and s is not steps[-1]))
 
     # -------------------------------------------------------------- the loop
+
+    def prepare(self) -> Iterator[Event]:
+        """Makes all that runs on the problem may need, so that later ones of this process lose no time to it: programs,
+        compiled and read here and by the workers, and seed tables. Yields programs as they come."""
+        order = self.compile_order()
+        operators = [operator_of(self.problem, transition) for transition in order]
+        for operator in operators:
+            self._runner.request(operator)
+        crew = self._crew()
+        try:
+            yield from self._await_first(operators)
+            if not self._stop.is_set():
+                crew.prepare(order)
+        finally:
+            crew.close()
 
     def events(
         self, time_budget: float, num_samples: int | None = None, clock: Callable[[], float] = time.perf_counter
@@ -675,6 +720,10 @@ class Sampler:
         """
         if self._patience > 0:
             return self._pursued
+        if not self._ended and self._pursued and self._chosen_for < FIRST_PURSUIT:
+            self._chosen_for += 1
+            return self._pursued
+        self._chosen_for = 0
         if self.settings.deterministic:
             path = self.chooser.select(None)
             for step in self._steps_of(path):
@@ -685,6 +734,11 @@ class Sampler:
         self._pursued = path
         return path
 
+    @property
+    def _known(self) -> Path:
+        """The sequence that is run whatever comes out of it: the incumbent of a tree, a fixed one; () without one."""
+        return getattr(self.chooser, "incumbent", getattr(self.chooser, "path", ()))
+
     def _next_job(self) -> _Job | None:
         path = self._choose()
         if not path:
@@ -692,7 +746,7 @@ class Sampler:
         job = self._job_of(path)
         # Before the first look at a step is over, a second one would tell the same.
         if job is None:
-            known = self._steady or getattr(self.chooser, "incumbent", ())
+            known = self._steady or self._known
             job = self._job_of(known) if known else None
         return job or self._job_of(path, again=True)
 
@@ -703,7 +757,7 @@ class Sampler:
         ends = (steps[-1].makes, *self._final_histories(path))
         position = makers[min(ends, key=lambda history: self._pool(history).size)]
         batch = self.settings.batch_size
-        known = getattr(self.chooser, "incumbent", ())
+        known = self._known
         while True:
             step = steps[position]
             slot = step.makes
@@ -712,8 +766,9 @@ class Sampler:
             visits = self._visits.get(slot, 0)
             young = visits < 2
             most = self._pace.affordable(step.operator)
-            if visits < LOOKS and path != known:
-                most = max(most * (visits + 1) // LOOKS, min(self.settings.lanes, batch))
+            grown = min(visits + 1, EXPLORED if known else LOOKS)
+            if grown < LOOKS and path != known:
+                most = max(most * grown // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.
             enough = max(most // (2 if visits else 8), 1)
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
@@ -725,6 +780,7 @@ class Sampler:
                     self._looked_at.add(slot)
                 if all(self._visits.get(step.makes, 0) > 1 for step in steps):
                     self._steady = path
+                self._ended |= step.transition.target == self._full
                 self._made[step.operator.identity].add(slot)
                 if path is self._pursued:
                     self._pursue(steps, position, visits)

@@ -102,13 +102,16 @@ CURIOUS_EVERY = 4
 """Only one choice in so many asks for a first trial: what it reads may have to be made before, and that takes time too."""
 
 
-EXPLORATION = 0.5
-"""Batches per operator that may go into sequences which promise hardly more than the incumbent, the best one that was run to
-the end, for every factor e of the time beyond so many: near ties cost more than they are worth, since what was made for one
-waits while another is run. Exploration thins out as the logarithm does in UCB."""
+EXPLORATION = 20.0
+"""Batches that may go into sequences which promise hardly more than the incumbent, the best one that was run to the end, for
+every factor e of batches beyond so many: near ties cost more than they are worth, since what was made for one waits while
+another is run. Exploration thins out as the logarithm does in UCB."""
 
-PROMISE = 1.2
+PROMISE = 1.1
 """What promises more than the incumbent by this factor is run at once, however much was explored."""
+
+DISAPPOINTED = 12
+"""Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
 CLEARLY_MORE = 1.05
 """By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
@@ -192,8 +195,8 @@ class Totals:
     """Of a whole run: batches, rollouts (attempts at the root), finished samples and the device seconds that were charged for
     them, all but batches discounted.
 
-    From the first incumbent on, not discounted: batches, and spent, the seconds that they took as they passed for a worker; of
-    these those of the first trials of operators, and those for other histories than the incumbent's.
+    From the first incumbent on, not discounted: batches, of these the explored ones, for other histories than the incumbent's;
+    spent, the seconds that batches took as they passed for a worker, of these those of the first trials of operators.
     """
 
     visits: float = 0.0
@@ -488,6 +491,11 @@ class _Records:
         """
         return self._renewed(self._follow((*prefix, transition))[-1].history).tries
 
+    def _rate_now(self, path: Path) -> float:
+        """Like `_rate_of`, by all that was recorded so far."""
+        components, _ = self._made_along(path)
+        return 1.0 / max(sum(self._renewed(history).item_cost for history in components), 1e-300)
+
     def _renewed(self, history: _History) -> _History:
         """With predictions by what is known now."""
         for read in history.reads:
@@ -502,10 +510,10 @@ class _Records:
         The best ones may differ only in the order of independent steps, and then have equal rates.
         """
         self._predict_operators()
+        paths = self._finished_paths()
         if self._states is not None:
-            paths = self._cheapest_paths(k, only_made=True)[self.transitions.full]
-        else:
-            paths = self._finished_paths()
+            # The cheapest way to a state may be one that was not gone on, and then takes the place of one that was.
+            paths = list(dict.fromkeys([*self._cheapest_paths(k, only_made=True)[self.transitions.full], *paths]))
         ranked = sorted(((path, self._rate_of(path)) for path in paths), key=lambda pair: -pair[1])
         return ranked[:k]
 
@@ -887,7 +895,13 @@ class Tree(_Records):
         # The greatest of all predicted rates, whether it was run to the end or not.
         path = next(iter(self._prefixes.get(self.transitions.full, ())), path)
         more = CLEARLY_MORE if exploring else PROMISE
-        return path if path and self._rate_of(path) > more * self._rate_of(incumbent) else incumbent
+        if not path or path == incumbent:
+            return incumbent
+        # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
+        if self._rate_now(path) > more * self._rate_now(incumbent):
+            return path
+        self._stale |= self._records_since_refresh > DISAPPOINTED
+        return incumbent
 
     def _promising(self, price: float) -> Path:
         """The sequence that the tree chooses by Q and bonus, step by step; () where none is ready."""
@@ -915,20 +929,16 @@ class Tree(_Records):
 
     @property
     def _allowed_to_explore(self) -> float:
-        """Seconds that may have gone by now into other sequences than the incumbent."""
-        total, batches = self._total, EXPLORATION * len(self._operators)
-        if not total.batches:
-            return 0.0
+        """Batches that may have gone by now into other sequences than the incumbent."""
         # After a warm start as little from the beginning as at the end of the earlier runs.
-        units = math.log1p(total.batches / (self._earlier_batches + batches))
-        return batches * units * total.spent / total.batches
+        return EXPLORATION * math.log1p(self._total.batches / (self._earlier_batches + EXPLORATION))
 
     def _spend(self, history: _History, seconds: float, is_first_trial: bool) -> None:
         if self._incumbent:
             self._total.batches += 1.0
             self._total.spent += seconds
             self._total.first_trials += seconds * is_first_trial
-            self._total.explored += seconds * (history not in self._of_incumbent)
+            self._total.explored += history not in self._of_incumbent
 
     def _renew_incumbent(self) -> None:
         """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more; after a warm

@@ -270,7 +270,7 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
 
 def _compile_seconds(scene: Mapping[str, Any], method: str) -> float:
     """Compile seconds of the programs that a method asks for, on a machine that has none of them."""
-    by_name = sum(program["seconds"] for program in scene["programs"])
+    by_name = sum(program["seconds"] for program in scene["preparation"]["programs"])
     if method in scene["sequences"]:
         # A fixed sequence asks for its own programs only; its runs report the seconds that these took.
         return max(instance["methods"][method]["compile"][0] for instance in scene["instances"][:1])

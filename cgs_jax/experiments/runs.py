@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
 from typing import Any
@@ -116,33 +116,10 @@ def execute(
 # ------------------------------------------------------------------ choosers
 
 
-class _Wait:
-    """Chooses nothing, and says when all operators are ready."""
-
-    rate = 0.0
-
-    def __init__(self, transitions: Transitions) -> None:
-        first: dict[Any, Transition] = {}
-        for transition in transitions.iterate():
-            first.setdefault(transition.problem, transition)
-        self._transitions = tuple(first.values())
-        self.when_ready: Callable[[], None] = lambda: None
-
-    def select(self, ready: Ready | None = None) -> Path:
-        if ready is None or all(map(ready, self._transitions)):
-            self.when_ready()
-        return ()
-
-    def record(self, *_: Any, **__: Any) -> None:
-        """Nothing runs, nothing is recorded."""
-
-
 def prepare(problem: Problem, settings: SamplerSettings | None = None) -> Iterator[Compiled]:
-    """Makes all programs of a problem ready; yields them as they come, also those that were ready before."""
-    chooser = _Wait(problem.transitions)
-    sampler = Sampler(problem, chooser, settings=settings)
-    chooser.when_ready = sampler.stop
-    for event in sampler.events(float("inf")):
+    """Makes ready what runs on a problem may need (`Sampler.prepare`); yields programs as they come, also those that were
+    ready before."""
+    for event in Sampler(problem, Tree(problem.transitions), settings=settings).prepare():
         if isinstance(event, Compiled):
             yield event
 

@@ -10,6 +10,7 @@ single conditional operators. sweep: price of time and exploration constant.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -55,15 +56,16 @@ class Budget:
     seconds: float
     seeds: int
     instances: int | None = None  # None: all
+    expert_seeds: int = 3  # of the experts, which learn nothing and differ little between seeds
     rand_seeds: int = 1  # of `rand`, which no claim compares closely
     reference_seconds: float = 4.0
     coverage_least: int = 200  # samples that a method needs for the comparison at equal count
-    sweep_instances: int = 3
+    sweep_instances: int = 2
     sweep_seeds: int = 1
     prices: tuple[float, ...] = (0.1, 1.0, 10.0)
     exploration: tuple[float, ...] = (0.01, 0.03, 0.15, 0.5)
     oracle_instances: int | None = None
-    survey_seconds_per_operator: float = 0.2
+    survey_seconds_per_operator: float = 0.1
     screened: int = 12
     screen_seconds: float = 1.5
     top: int = 2
@@ -80,7 +82,6 @@ QUICK = Budget(
     sweep_instances=1,
     exploration=(0.003, 0.3),
     oracle_instances=1,
-    survey_seconds_per_operator=0.1,
     screened=8,
     screen_seconds=1.0,
     operation_seconds=2.0,
@@ -151,7 +152,7 @@ class Study:
             for seed in range(self.budget.seeds)
             for instance in self.instances(scene)
             for method in self.methods(scene)
-            if method != "rand" or seed < self.budget.rand_seeds
+            if seed < {"tree": self.budget.seeds, "rand": self.budget.rand_seeds}.get(method, self.budget.expert_seeds)
         ]
 
     def warm_runs(self, scene: str) -> list[Run]:
@@ -261,19 +262,23 @@ class Study:
         yield Progress("done", total, total)
 
     def _compile(self, scene: str) -> None:
-        """Programs of all instances; what the first process of a study needed is kept, later ones find it cached."""
+        """Makes ready all instances, so that no run loses time to it, whichever comes first. What it took the first process
+        of a study is kept, later ones find most of it cached."""
         path = self.folder / f"compile_{scene}.json"
         known: set[str] = set()
         programs: list[dict[str, Any]] = []
+        seconds: list[float] = []
         for instance in self.instances(scene):
+            began = time.perf_counter()
             for event in prepare(self.problem(scene, instance), self.settings):
                 # Programs are shared between instances; the same name and duration is the same program.
                 key = f"{event.name} {event.seconds}"
                 if key not in known:
                     known.add(key)
                     programs.append({"name": event.name, "seconds": event.seconds, "instance": instance})
+            seconds.append(round(time.perf_counter() - began, 2))
         if not path.exists():
-            write_json(path, programs)
+            write_json(path, {"programs": programs, "seconds": seconds})
 
     def _execute(self, run: Run) -> None:
         problem = self.problem(run.scene, run.instance)
@@ -353,7 +358,7 @@ class Study:
             "paper": dict(self._printed(scene)),
             "budget": asdict(self.budget),
             "sequences": dict(task.sequences),
-            "programs": json.loads(compiled.read_text(encoding="utf-8")) if compiled.exists() else [],
+            "preparation": json.loads(compiled.read_text(encoding="utf-8")),
             "times": measures.time_grid(self.budget.seconds).tolist(),
             "instances": [self._instance(scene, instance) for instance in self.instances(scene)],
             "sweep": self._sweep(scene),
