@@ -190,8 +190,8 @@ PATIENCE = 4
 """Batches that may be spent until the step after one that was looked at for the first time is looked at too."""
 
 FIRST_PURSUIT = 24
-"""Choices for which the first sequences are kept, until one was run to its end: samples are wanted soon, and what others promise
-more than it can be told from then on."""
+"""Choices for which the first sequences are kept, until one was run to its end: samples are wanted soon, and from then on what
+others promise has something to be compared with."""
 
 FEW_HISTORIES = 3
 """Only while that step's operator ran after fewer histories than this: the tree judges it by those alone."""

@@ -8,6 +8,7 @@ from loaded import problem
 
 from cgs_jax.api import make_chooser
 from cgs_jax.errors import InputError
+from cgs_jax.operators import operator_of
 from cgs_jax.sampler import Finished, Found, Pool, Ran, Sampler, SamplerSettings, Started
 
 SETTINGS = SamplerSettings(batch_size=128, lanes=32, workers=1, deterministic=True)
@@ -48,6 +49,39 @@ def test_events_come_in_order_and_end_with_the_number_asked_for(fixed):
     for event in of(Found, fixed):
         assert {name: len(value) for name, value in event.values.items()} == dict.fromkeys(("t", "q1", "q2"), len(event.qpos))
         assert event.qpos.shape[1:] == (2, problem("pick_place").scene.model.nq)
+
+
+def test_a_fixed_sequence_runs_full_batches_from_the_first_one_on(fixed):
+    assert of(Ran, fixed)[0].tasks == SETTINGS.batch_size
+
+
+def test_the_tree_pursues_its_first_sequence_to_the_end_and_explores_in_small_batches():
+    begun = sampler("tree", batch_size=512)
+    tree, known = begun.chooser, ()
+    before_the_end, explored = set(), []
+    ended = False
+    for event in begun.events(60.0, 2000):
+        if not isinstance(event, Ran):
+            continue
+        ended |= event.position == len(event.path) - 1
+        if not ended:
+            before_the_end.add(event.path)
+        if known and event.path != known:
+            explored.append(event.tasks)
+        known = tree.incumbent
+    assert len(before_the_end) == 1
+    assert explored and max(explored) <= 512 // 4
+
+
+def test_what_runs_may_need_is_made_before_them():
+    at = problem("pick_place")
+    begun = sampler("tree")
+    list(begun.prepare())
+    first = {transition.problem: transition for transition in at.transitions.all()}
+    for transition in first.values():
+        operator = operator_of(at, transition)
+        assert begun._runner.ready(operator) and begun._runner.is_aimed(operator)
+        assert all(future.result()._executable is not None for future in begun._runner.request(operator))
 
 
 def test_numbers_of_a_batch_add_up(fixed):

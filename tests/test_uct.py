@@ -449,6 +449,37 @@ def test_the_incumbent_is_run_while_others_promise_little_more():
     assert late.count(favourite) > 0.95 * len(late)
 
 
+def test_what_disappoints_at_its_first_steps_is_given_up_before_its_last():
+    """(a,b) makes 5 samples/s. b after a promises 50, until a begins to fail: known at once, not at the next refresh."""
+    transitions = pair_graph()
+    joint, alone = transitions.parse("(a,b)"), transitions.parse("a; b")
+    tree = Tree(transitions)
+    for _ in range(3):
+        tree.record((), alone[0], 100, 100, 1.0)
+        tree.record(alone[:1], alone[1], 100, 100, 1.0)
+    for _ in range(100):
+        tree.record((), joint[0], 100, 5, 1.0)
+    tree._refresh()
+    tree._incumbent, tree._of_incumbent = joint, frozenset(tree._made_along(joint)[1])
+    tree._total.explored = 1e9  # no time to explore
+    tree._choices = 0
+    assert tree.select() == alone
+    tree._stale = False
+    for _ in range(10):
+        tree.record((), alone[0], 1000, 1, 10.0)
+    assert not tree._stale and tree.select() == joint
+
+
+def test_the_best_sequence_is_one_that_was_run_to_the_end_though_a_cheaper_way_was_not_gone_on():
+    transitions = Transitions(pick_place())
+    finished, begun = transitions.parse("t; q1; q2"), transitions.parse("(t,q1); q2")
+    tree = Tree(transitions)
+    for position, step in enumerate(finished):
+        tree.record(finished[:position], step, 100, 20, 1.0)
+    tree.record((), begun[0], 100, 100, 0.01)
+    assert [path for path, _ in tree.best_sequences(1)] == [finished]
+
+
 def test_random_is_uniform_over_children_and_repeatable():
     transitions = Transitions(pick_place())
     chooser, again = Random(transitions, seed=4), Random(transitions, seed=4)

@@ -81,13 +81,13 @@ def rates(scene: Mapping[str, Any], path: Path) -> None:
             axis.set_ylim(bottom=0.0)
             axis.set_xlim(0.0, times[-1])
         absolute.set_ylim(top=1.28 * absolute.get_ylim()[1])
-        names = list(colours)
-        seconds = [_compile_seconds(scene, name) for name in names]
-        compile_axis.barh(range(len(names)), seconds, color=list(colours.values()))
-        compile_axis.set_yticks(range(len(names)), names)
+        programs = scene["preparation"]["programs"]
+        kinds = {kind: [p["seconds"] for p in programs if p["name"].startswith(kind)] for kind in ("solve", "clearance")}
+        bars = [f"{_number(len(seconds), 'program')}\n{kind}" for kind, seconds in kinds.items()]
+        compile_axis.barh(bars, [sum(seconds) for seconds in kinds.values()], color="0.55", height=0.5)
         compile_axis.invert_yaxis()
         compile_axis.grid(axis="y", visible=False)
-        compile_axis.set(title="Compile time before", xlabel="s, once per machine")
+        compile_axis.set(title="Compile time before", xlabel="s on one thread, once per machine;\na fixed sequence needs some")
         count = len(scene["instances"])
         seeds = scene["budget"]["seeds"]
         figure.suptitle(f"{scene['title']}: {_number(count, 'instance')}, {_number(seeds, 'seed')}; bands: middle half")
@@ -266,15 +266,6 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
         right.legend(fontsize=8)
         figure.suptitle(f"{scene['title']}: fixed sequences")
         _save(figure, path)
-
-
-def _compile_seconds(scene: Mapping[str, Any], method: str) -> float:
-    """Compile seconds of the programs that a method asks for, on a machine that has none of them."""
-    by_name = sum(program["seconds"] for program in scene["preparation"]["programs"])
-    if method in scene["sequences"]:
-        # A fixed sequence asks for its own programs only; its runs report the seconds that these took.
-        return max(instance["methods"][method]["compile"][0] for instance in scene["instances"][:1])
-    return by_name
 
 
 def _number(count: int, what: str) -> str:

@@ -223,8 +223,8 @@ def _compile(scene: Mapping[str, Any]) -> str:
     note = (
         f"{len(programs)} programs, {total:.0f} s on one thread, once per machine (they are kept on disk); "
         f"{'none' if not later else len(later)} for instances after the first. "
-        f"With them, with the programs read by this process and its workers, and with the seed tables made, all of it before any "
-        f"run, the first instance was ready after {seconds[0]:.1f} s"
+        "All of it is done before any run: with programs compiled and read by this process and its workers, and seed tables "
+        f"made, the first instance was ready after {seconds[0]:.1f} s"
     )
     if seconds[1:]:
         note += f" and every further one after {np.mean(seconds[1:]):.1f} s more"

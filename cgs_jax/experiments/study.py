@@ -393,7 +393,7 @@ class Study:
             kept = self.store.read(run, values=True)
             entry = methods.setdefault(
                 run.method,
-                {"final": [], "total": [], "rates": [], "first": [], "startup": [], "compile": [], "rejected": 0,
+                {"final": [], "total": [], "rates": [], "first": [], "startup": [], "rejected": 0,
                  "max_violation": 0.0, "focus": [], "best": []},
             )
             meta = kept.data["meta"]
@@ -402,7 +402,6 @@ class Study:
             entry["rates"].append(measures.rate_over_time(kept.elapsed, times))
             entry["first"].append(float(kept.elapsed.min()) if len(kept.elapsed) else None)
             entry["startup"].append(meta["startup_seconds"])
-            entry["compile"].append(meta["compile_seconds"])
             entry["rejected"] += meta["rejected_by_audit"]
             entry["max_violation"] = max(entry["max_violation"], kept.data["max_violation"])
             entry["best"].append(kept.data["best_sequences"][:1])
