@@ -221,6 +221,16 @@ def test_claims_are_confronted_with_the_numbers(finished):
     assert claim("passed the audit").passed is False
 
 
+def test_an_operation_out_of_order_is_named_with_what_its_conditions_allow(finished):
+    scene = finished[0].numbers("handover")
+    operations = [entry for entry in scene["operations"] if entry["measured_microseconds"]]
+    operations[0] |= {"measured_success": 0.1, "condition_feasible": 0.25}
+    first, second = operations[0]["title"], operations[1]["title"]
+    claim = next(c for c in claims.confront({"scenes": {"handover": scene}, "counts": {}}) if "larger operations" in c.text)
+    assert not claim.passed
+    assert f"{first} 10% below {second} " in claim.reason and "25% of its conditions" in claim.reason
+
+
 def test_command_refuses_bad_numbers_in_one_line(tmp_path):
     command = [sys.executable, str(ROOT / "scripts" / "reproduce.py"), "--seeds", "0", "--out", str(tmp_path / "out")]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

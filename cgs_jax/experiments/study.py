@@ -39,11 +39,11 @@ from cgs_jax.record import operator_text, write_json
 from cgs_jax.sampler import SamplerSettings
 from cgs_jax.uct import Path, Tree
 
-RUN_OVERHEAD = 0.5
+RUN_OVERHEAD = 0.4
 """Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
 
-COMPILE_PER_OPERATOR = 1.6
-"""Seconds to compile a scene's programs on two cores, per conditional problem (they share programs); for the estimate."""
+COMPILE_PER_OPERATOR = 0.5
+"""Seconds to make a scene ready on two cores, per conditional problem (they share programs); for the estimate."""
 
 HELD_OUT = 1000
 """Seed of the runs that make the reference set; no other run has it."""
