@@ -766,7 +766,8 @@ class Sampler:
             visits = self._visits.get(slot, 0)
             young = visits < 2
             most = self._pace.affordable(step.operator)
-            grown = min(visits + 1, EXPLORED if known else LOOKS)
+            explored = known and path != getattr(self.chooser, "promised", ())
+            grown = min(visits + 1, EXPLORED if explored else LOOKS)
             if grown < LOOKS and path != known:
                 most = max(most * grown // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.

@@ -840,6 +840,7 @@ class Tree(_Records):
         self._choices = 0
         self._earlier_batches = 0.0  # of earlier instances
         self._incumbent: Path = ()
+        self._promised: Path = ()
         self._of_incumbent: frozenset[_History] = frozenset()
         self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
         self._epoch = 0  # of the values: they change with the price too
@@ -859,6 +860,11 @@ class Tree(_Records):
     def incumbent(self) -> Path:
         """The sequence that is run unless another promises more; () until there is one."""
         return self._incumbent
+
+    @property
+    def promised(self) -> Path:
+        """The sequence that was last run because it promised more than the incumbent."""
+        return self._promised
 
     @property
     def c_hat(self) -> float | None:
@@ -899,6 +905,7 @@ class Tree(_Records):
             return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
         if self._rate_now(path) > more * self._rate_now(incumbent):
+            self._promised = path
             return path
         self._stale |= self._records_since_refresh > DISAPPOINTED
         return incumbent
@@ -1079,7 +1086,9 @@ class Tree(_Records):
         """Back up along the sequence at once; everything else follows at the next refresh."""
         self._records_since_refresh += 1
         made = lineage[-1].history
-        first_time = made.operator.statistics.visits <= made.statistics.visits <= 1.0
+        first_time = made.statistics.visits <= 1.0 and (
+            made.operator.statistics.visits <= made.statistics.visits or made.made == self.transitions.full
+        )
         # A refresh visits every edge of the tree: its cost is spread over a proportional number of records.
         if first_time or self._records_since_refresh > max(48, self._edges_evaluated // 16):
             self._stale = True
