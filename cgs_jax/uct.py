@@ -113,6 +113,15 @@ PROMISE = 1.1
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
+PROVEN_VISITS = 2.0
+"""Batches of its last operator from which on an earlier instance tells what rate a sequence had there."""
+
+UNPROVEN = 0.5
+"""Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
+
+EARLIER_PROMISE = 1.3
+"""The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
+
 CLEARLY_MORE = 1.05
 """By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
 
@@ -401,6 +410,7 @@ class _Records:
         self._outlook = _Outlook()
         self._root = self._node_of(frozenset(), ())
         self._total = Totals()
+        self._proven: Path = ()  # on earlier instances
         self._version = 0  # of the predictions
 
     # What happened
@@ -510,7 +520,7 @@ class _Records:
         The best ones may differ only in the order of independent steps, and then have equal rates.
         """
         self._predict_operators()
-        paths = self._finished_paths()
+        paths = self._finished_paths(self._known)
         if self._states is not None:
             # The cheapest way to a state may be one that was not gone on, and then takes the place of one that was.
             paths = list(dict.fromkeys([*self._cheapest_paths(k, only_made=True)[self.transitions.full], *paths]))
@@ -531,9 +541,9 @@ class _Records:
             histories = (*histories, history)
         return components, histories
 
-    def _finished_paths(self) -> list[Path]:
+    def _finished_paths(self, histories: Iterable[_History]) -> list[Path]:
         full = self.transitions.full
-        return [history.prefixes[0] for history in self._known if history.prefixes[0][-1].target == full]
+        return [history.prefixes[0] for history in histories if history.prefixes[0][-1].target == full]
 
     def _cheapest_paths(
         self, k: int, among: Callable[[_Step], bool] = lambda step: True, only_made: bool = False
@@ -773,15 +783,19 @@ class _Records:
             raise InputError(f"n_equiv is {n_equiv} batches; expected more than 0")
         of_operator: dict[Problem, list[Statistics]] = {}
         of_history: dict[_History, list[Statistics]] = {}
+        by_instance: list[dict[_History, Statistics]] = []
         totals = []
         for data in earlier:
             for problem, entry in _operators_in(self.transitions, data).items():
                 of_operator.setdefault(problem, []).append(_read_statistics(entry))
-            for entry in data["sequences"]:
-                of_history.setdefault(self._history_at(entry["sequence"]), []).append(_read_statistics(entry))
+            there = {self._history_at(entry["sequence"]): _read_statistics(entry) for entry in data["sequences"]}
+            for history, statistics in there.items():
+                of_history.setdefault(history, []).append(statistics)
+            by_instance.append(there)
             totals.append(Totals(**data["totals"]))
         for problem, statistics in of_operator.items():
             self._operator(problem).statistics = _averaged(statistics, n_equiv)
+        self._proven = self._proven_on(by_instance)
         for history, statistics in of_history.items():
             history.borrowed = _averaged(statistics, n_equiv)
             ours, pooled = history.borrowed.observed, history.operator.statistics.observed
@@ -794,6 +808,25 @@ class _Records:
             roots = sum(total.rollouts / total.seconds for total in totals) / len(totals)
             self._total = Totals(rollouts=roots * seconds, samples=rate * seconds, seconds=seconds)
         self._predict_operators()
+
+
+    def _proven_on(self, instances: list[dict[_History, Statistics]]) -> Path:
+        """The sequence that did best on instances, by the rates it had there over the greatest ones; () without any.
+
+        Averages of predictions would favour what was run on few instances, those where it is good, and promises much elsewhere.
+        """
+        shares: dict[_History, list[float]] = {}
+        for there in instances:
+            costs: dict[_History, float] = {}
+            ended = [h for h, known in there.items() if h.made == self.transitions.full and known.visits >= PROVEN_VISITS]
+            rates = {history: 1.0 / max(_cost_there(history, there, costs), 1e-300) for history in ended}
+            greatest = max(rates.values(), default=0.0)
+            for history, rate in rates.items():
+                if greatest > 0.0:
+                    shares.setdefault(history, []).append(rate / greatest)
+        # A share more than a sequence would have that was not run is what an instance says for it.
+        best = max(shares, key=lambda history: sum(share - UNPROVEN for share in shares[history]), default=None)
+        return best.prefixes[0] if best else ()
 
 
 class Tree(_Records):
@@ -900,9 +933,12 @@ class Tree(_Records):
             path = ()
         # The greatest of all predicted rates, whether it was run to the end or not.
         path = next(iter(self._prefixes.get(self.transitions.full, ())), path)
-        more = CLEARLY_MORE if exploring else PROMISE
         if not path or path == incumbent:
             return incumbent
+        more = CLEARLY_MORE if exploring else PROMISE
+        # What other instances promise is the more than they keep, the less they were run there.
+        if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
+            more = EARLIER_PROMISE
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
         if self._rate_now(path) > more * self._rate_now(incumbent):
             self._promised = path
@@ -949,13 +985,13 @@ class Tree(_Records):
 
     def _renew_incumbent(self) -> None:
         """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more; after a warm
-        start of all, until one was."""
+        start the one that is proven, until another was."""
         if self.reward != "rate":
             return
-        if not self._incumbent and self._earlier_batches:
-            for path in self._prefixes.get(self.transitions.full, []):
-                self._incumbent, self._of_incumbent = path, frozenset(self._made_along(path)[1])
-        rates = [(self._rate_of(path), path) for path in self._finished_paths()]
+        if not self._incumbent and self._proven:
+            self._incumbent, self._of_incumbent = self._proven, frozenset(self._made_along(self._proven)[1])
+        here = [history for history in self._known if history.statistics.visits]
+        rates = [(self._rate_of(path), path) for path in self._finished_paths(here)]
         rate, path = max(rates, default=(0.0, ()), key=lambda pair: pair[0])
         if path and (not self._incumbent or rate > CLEARLY_MORE * self._rate_of(self._incumbent)):
             self._incumbent, self._of_incumbent = path, frozenset(self._made_along(path)[1])
@@ -1398,6 +1434,18 @@ def _within(hazards: Sequence[float]) -> list[tuple[float, float]]:
         failed *= 1.0 - hazard
         result.append((1.0 - failed, tries))
     return result
+
+
+def _cost_there(history: _History, there: dict[_History, Statistics], costs: dict[_History, float]) -> float:
+    """Device seconds per item of a history by what was seen on one instance alone; infinite where that tells nothing."""
+    if history not in costs:
+        known = there.get(history)
+        costs[history] = math.inf
+        if known is not None and known.observed:
+            reads = sum(_cost_there(read, there, costs) for read in history.reads)
+            within = _within(known.observed)
+            costs[history] = min((reads + tries * known.seconds / known.tries) / max(s, 1e-12) for s, tries in within)
+    return costs[history]
 
 
 def _add(to: Statistics, other: Statistics) -> None:
