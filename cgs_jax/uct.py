@@ -76,6 +76,9 @@ VISIT_TRIES = 32
 NEXT_TRY = 30.0
 """Weight, in tries, of the belief that a further try succeeds as often as the one before."""
 
+RETRIES = 300.0
+"""Weight, in tries, of what earlier instances say of each further try, as far as they made so many."""
+
 ENUMERABLE = 3000
 """Up to this many transitions the values below the tree come from dynamic programming over all states."""
 
@@ -119,7 +122,7 @@ PROVEN_VISITS = 2.0
 UNPROVEN = 0.5
 """Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
 
-EARLIER_PROMISE = 1.3
+EARLIER_PROMISE = 1.6
 """The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
 
 CLEARLY_MORE = 1.05
@@ -1518,7 +1521,11 @@ def _averaged(earlier: list[Statistics], n_equiv: float) -> Statistics:
         reached = [s for s in earlier if k < len(s.attempts) and s.attempts[k]]
         share = sum(s.attempts[k] / s.tries for s in reached) / len(earlier)
         hazard = sum(s.successes[k] / s.attempts[k] for s in reached) / len(reached) if reached else 0.0
-        attempts.append(visits * per_visit * share)
+        tries = visits * per_visit * share
+        if k:
+            # How much less a further try succeeds is alike on all instances, however much the first ones differ.
+            tries = max(tries, min(RETRIES, sum(s.attempts[k] for s in reached)))
+        attempts.append(tries)
         successes.append(attempts[-1] * hazard)
     return Statistics(visits, attempts, successes, sum(attempts) * seconds)
 
