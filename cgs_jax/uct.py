@@ -122,7 +122,7 @@ PROVEN_VISITS = 2.0
 UNPROVEN = 0.5
 """Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
 
-EARLIER_PROMISE = 1.6
+EARLIER_PROMISE = 1.2
 """The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
 
 CLEARLY_MORE = 1.05
@@ -874,7 +874,7 @@ class Tree(_Records):
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
         self._choices = 0
-        self._earlier_batches = 0.0  # of earlier instances
+        self._earlier_batches = 0.0  # of an earlier instance
         self._incumbent: Path = ()
         self._promised: Path = ()
         self._of_incumbent: frozenset[_History] = frozenset()
@@ -1314,7 +1314,7 @@ class Tree(_Records):
 
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
-        self._earlier_batches = sum(data["totals"].get("batches", 0.0) for data in earlier)
+        self._earlier_batches = sum(data["totals"].get("batches", 0.0) for data in earlier) / max(len(earlier), 1)
         self._stale = True
 
     @classmethod
