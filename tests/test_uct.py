@@ -429,6 +429,39 @@ def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails
     Tree(transitions).warm_start([old], n_equiv=5)
 
 
+def test_a_warm_start_begins_with_what_did_well_on_most_instances():
+    """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average of predictions."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    earlier = []
+    for instance in range(3):
+        tree = Tree(transitions)
+        for _ in range(200):
+            tree.record((), common[0], 100, 50, 1.0)
+            tree.record(common[:1], common[1], 50, 50, 1.0)
+            if instance == 2:
+                tree.record((), rare[0], 100, 50, 1.0)
+        earlier.append(tree.as_json())
+    warm = Tree(transitions)
+    warm.warm_start(earlier, n_equiv=5)
+    warm.select()
+    assert warm.incumbent == common
+
+
+def test_a_warm_start_keeps_how_further_tries_fall_off_where_instances_differ():
+    transitions = pair_graph()
+    (step,) = transitions.parse("(a,b)")
+    earlier = []
+    for first in (10, 90):
+        tree = Tree(transitions)
+        for _ in range(50):
+            tree.record((), step, [100, 100 - first], [first, (100 - first) // 10], 1.0)
+        earlier.append(tree.as_json())
+    warm = Tree(transitions)
+    warm.warm_start(earlier, n_equiv=5)
+    assert warm._operator(step.problem).hazards[1] == pytest.approx(0.1, abs=0.05)
+
+
 def test_the_incumbent_is_run_while_others_promise_little_more():
     """Two sequences of nearly equal rates, after many batches: one of them is run nearly always, and each has been run."""
     transitions = pair_graph()
