@@ -113,6 +113,9 @@ another is run. Exploration thins out as the logarithm does in UCB."""
 PROMISE = 1.1
 """What promises more than the incumbent by this factor is run at once, however much was explored."""
 
+EARLIER_PROMISE = 1.2
+"""The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
+
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
@@ -121,9 +124,6 @@ PROVEN_VISITS = 2.0
 
 UNPROVEN = 0.5
 """Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
-
-EARLIER_PROMISE = 1.2
-"""The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
 
 CLEARLY_MORE = 1.05
 """By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
@@ -939,7 +939,7 @@ class Tree(_Records):
         if not path or path == incumbent:
             return incumbent
         more = CLEARLY_MORE if exploring else PROMISE
-        # What other instances promise is the more than they keep, the less they were run there.
+        # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
             more = EARLIER_PROMISE
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
