@@ -196,6 +196,9 @@ others promise has something to be compared with."""
 FEW_HISTORIES = 3
 """Only while that step's operator ran after fewer histories than this: the tree judges it by those alone."""
 
+FIRST_LOOK = 16
+"""Conditions that are enough for the first batch in a place: they tell a half from a tenth, and at once."""
+
 FIRST_GUESS = 2e-8
 """Device seconds per task or iteration and squared unknown, before anything has run: rather too few, so that what was looked at
 first is not given up for it."""
@@ -771,7 +774,7 @@ class Sampler:
             if grown < LOOKS and path != known:
                 most = max(most * grown // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.
-            enough = max(most // (2 if visits else 8), 1)
+            enough = max(most // 2, 1) if visits else min(FIRST_LOOK, max(most // 8, 1))
             scarcest = min(step.reads, key=lambda read: self._pool(read).size, default=None)
             if scarcest is None or waiting.size + self._pool(scarcest).size >= enough:
                 count = most
@@ -795,8 +798,6 @@ class Sampler:
             following = steps[position + 1 : position + 2]
             known = len(self._made[following[0].operator.identity]) if following else FEW_HISTORIES
             self._patience = PATIENCE if known < FEW_HISTORIES else 0
-        elif visits >= 2:
-            self._patience = 0
         else:
             self._patience = max(self._patience - 1, 0)
 
