@@ -73,6 +73,15 @@ def test_the_tree_pursues_its_first_sequence_to_the_end_and_explores_in_small_ba
     assert explored and max(explored) <= 512 // 4
 
 
+@pytest.mark.parametrize(("waiting", "looked_at"), [(15, "t"), (16, "q1")])
+def test_a_first_look_takes_few_conditions(waiting, looked_at):
+    begun = sampler("t; q1; q2", batch_size=2048)
+    path = begun.chooser.path
+    grasps, *_ = begun._steps_of(path)
+    begun._pool(grasps.makes).put({"t": np.zeros((waiting, 7), np.float32)})
+    assert begun._job_of(path).step.transition.new == (looked_at,)
+
+
 def test_what_runs_may_need_is_made_before_them():
     at = problem("pick_place")
     begun = sampler("tree")
