@@ -42,7 +42,10 @@ class Cell:
 
     joint: of configurations and plain vectors, in their own unit (rad for joints).
     position: of a pose's position, m.
-    rotation: of a pose's rotation, rad; rounded so that a whole number of cells fills a quarter turn to either side.
+    rotation: of a pose's rotation, rad; rounded so that an odd number of cells fills half a turn.
+
+    A cell is around zero, not beside it: what constraints hold at zero is so within a tolerance, and would be spread over
+    several cells.
     """
 
     joint: float = 0.5
@@ -90,8 +93,8 @@ def cell_indices(values: Values, cell: Cell, kind: str | None = None) -> NDArray
     """
     values, kind = _checked(values, kind)
     if kind != "pose":
-        return np.floor(values / cell.joint).astype(np.int64)
-    position = np.floor(values[:, :3] / cell.position).astype(np.int64)
+        return np.rint(values / cell.joint).astype(np.int64)
+    position = np.rint(values[:, :3] / cell.position).astype(np.int64)
     return np.concatenate([position, _rotation_cells(values[:, 3:], cell.rotation)], axis=1)
 
 
@@ -127,7 +130,7 @@ class CoverageGain:
 
 def _rotation_cells(quaternions: Values, size: float) -> NDArray[np.int64]:
     """Face and three indices (N, 4) on the cube around the unit quaternions (N, 4)."""
-    per_face = max(1, round(math.pi / size))
+    per_face = 1 + 2 * max(0, round((math.pi / size - 1.0) / 2.0))
     face = np.abs(quaternions).argmax(axis=1)
     largest = np.take_along_axis(quaternions, face[:, None], axis=1)
     others = np.stack([np.delete(np.arange(4), i) for i in range(4)])[face]

@@ -430,7 +430,7 @@ def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails
 
 
 def test_a_warm_start_begins_with_what_did_well_on_most_instances():
-    """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average of predictions."""
+    """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average."""
     transitions = pair_graph()
     common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
     earlier = []

@@ -62,13 +62,14 @@ def expert_ratios(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def oracle_ratios(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Per instance with an oracle: the best fixed sequence run, and tree's final rate over its, with interval."""
-    by_number = {instance["instance"]: instance for instance in scene["instances"]}
+    """Per instance with an oracle: the best fixed sequence by what the tree made beside it, and tree's rate over its, with
+    interval."""
     result = []
     for oracle in scene["oracle"]:
-        best = max(oracle["measured"], key=lambda label: np.mean(oracle["measured"][label]["final"]))
+        shares = {label: np.mean(e["final"]) / max(np.mean(e["tree"]), 1e-9) for label, e in oracle["measured"].items()}
+        best = max(shares, key=lambda label: shares[label])
         entry = oracle["measured"][best]
-        ratio = measures.ratio_with_interval(finals(by_number[oracle["instance"]], "tree"), entry["final"])
+        ratio = measures.ratio_with_interval(entry["tree"], entry["final"])
         result.append(
             {
                 "instance": oracle["instance"],

@@ -337,8 +337,9 @@ def _oracle(scene: Mapping[str, Any]) -> str:
     note = (
         "Rates of all complete sequences are predicted from the operators' statistics (tree and survey); of sequences "
         "that differ only in the order of independent operators one is kept. The best predicted ones are screened shortly; "
-        "the best of these, the experts and the sequences that the paper found are run with the same pools and retries; "
-        "the last column is the tree's regret. *Trust*: measured over predicted rate of the screened ones, median."
+        "the best of these, the experts and the sequences that the paper found are run with the same pools and retries, and "
+        "the tree beside them: the last column is its regret. *Trust*: measured over predicted rate of the screened ones, "
+        "median."
     )
     return table(head, rows) + "\n\n" + note
 

@@ -200,7 +200,8 @@ class Study:
         ]
 
     def fixed_runs(self, scene: str) -> list[Run]:
-        labels = [f"screened {i + 1}" for i in range(self.budget.top)]
+        # The tree once more, beside them: the machine may be faster or slower than it was in the main runs.
+        labels = ["tree", *(f"screened {i + 1}" for i in range(self.budget.top))]
         labels += [f"paper {i + 1}" for i in range(len(self._printed(scene).get("found", [])))]
         return [
             Run("fixed", scene, instance, label, seed, self.budget.seconds)
@@ -295,7 +296,7 @@ class Study:
         elif run.stage == "survey":
             chooser = Survey(transitions)
         elif run.stage in ("screen", "fixed"):
-            chooser = make_chooser(problem, self._sequence(run), run.seed)
+            chooser = make_chooser(problem, "tree" if run.method == "tree" else self._sequence(run), run.seed)
         else:
             # Second tries tell conditions that cannot be met from failures of the solver; first tries are counted apart.
             settings = SamplerSettings(tries=2, workers=1)
@@ -443,20 +444,23 @@ class Study:
         ranked = self.ranking(scene, instance)
         predicted = {signature(path): rate for path, rate in ranked}
         measured: dict[str, dict[str, Any]] = {}
-        runs = [run for run in self.fixed_runs(scene) if run.instance == instance]
-        runs += [
-            run
-            for run in self.main_runs(scene)
-            if run.instance == instance and run.method in self.problem(scene).scene.task.sequences
-        ]
+        named = self.problem(scene).scene.task.sequences
+        runs = [run for run in [*self.fixed_runs(scene), *self.main_runs(scene)] if run.instance == instance]
+        trees: dict[str, list[float]] = {}
         for run in runs:
-            text = self.problem(scene).scene.task.sequences.get(run.method) or self._sequence(run)
+            if run.method == "tree":
+                trees.setdefault(run.stage, []).append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
+        for run in runs:
+            if run.method == "tree" or run.stage == "main" and run.method not in named:
+                continue
+            text = named.get(run.method) or self._sequence(run)
             entry = measured.setdefault(
                 run.method,
                 {
                     "sequence": text,
                     "predicted": predicted.get(signature(transitions.parse(text))),
                     "final": [],
+                    "tree": trees[run.stage],  # beside it
                 },
             )
             entry["final"].append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
