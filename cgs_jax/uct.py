@@ -792,8 +792,8 @@ class _Records:
             for problem, entry in _operators_in(self.transitions, data).items():
                 of_operator.setdefault(problem, []).append(_read_statistics(entry))
             there = {self._history_at(entry["sequence"]): _read_statistics(entry) for entry in data["sequences"]}
-            for history, statistics in there.items():
-                of_history.setdefault(history, []).append(statistics)
+            for history, known in there.items():
+                of_history.setdefault(history, []).append(known)
             by_instance.append(there)
             totals.append(Totals(**data["totals"]))
         for problem, statistics in of_operator.items():

@@ -87,7 +87,7 @@ def rates(scene: Mapping[str, Any], path: Path) -> None:
         compile_axis.barh(bars, [sum(seconds) for seconds in kinds.values()], color="0.55", height=0.5)
         compile_axis.invert_yaxis()
         compile_axis.grid(axis="y", visible=False)
-        compile_axis.set(title="Compile time before", xlabel="s on one thread, once per machine;\na fixed sequence needs some")
+        compile_axis.set(title="Compile time before", xlabel="s, once per machine;\na sequence needs some")
         count = len(scene["instances"])
         seeds = scene["budget"]["seeds"]
         figure.suptitle(f"{scene['title']}: {_number(count, 'instance')}, {_number(seeds, 'seed')}; bands: middle half")
