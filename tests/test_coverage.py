@@ -127,7 +127,7 @@ def test_what_holds_within_a_tolerance_lies_in_the_cells_of_what_holds_exactly()
     noisy = exact + np.random.default_rng(1).normal(scale=1e-6, size=exact.shape)
     noisy[:, 3:] /= np.linalg.norm(noisy[:, 3:], axis=1, keepdims=True)
     cell = Cell(position=0.01, rotation=0.1)
-    count = projected_coverage(exact, cell, kinds=None)
+    count = projected_coverage(exact, cell)
     assert count == pytest.approx(2.0 * np.pi / 0.1, rel=0.05)
     assert projected_coverage(noisy, cell) <= count + 2
 
