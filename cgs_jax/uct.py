@@ -36,7 +36,7 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Literal, Protocol
 
 from cgs_jax.errors import InputError
@@ -62,12 +62,15 @@ HARDNESS_LOOPS = 3.0
 """Weight, in loops, of the belief that an instance is as hard as guessed."""
 
 CORRELATION = 0.03
-"""Guess of how much of the variance of success lies between the histories of an operator (`_Records._correlation`)."""
+"""Guess of how much of the variance of success lies between the histories of an operator (`_Records._correlations`)."""
 
 CORRELATION_TRIES = 1000.0
 """Weight of that guess, in tries."""
 
-OPERATOR_TIME_TRIES = 300.0
+OWN_CORRELATION_TRIES = 300.0
+"""Weight of what all operators say of it where it is estimated for one of them, in tries."""
+
+OPERATOR_TIME_TRIES = 3000.0
 """A history believes its operator's pooled time of a try as if it had seen so many: it varies less than success."""
 
 VISIT_TRIES = 32
@@ -119,11 +122,26 @@ EARLIER_PROMISE = 1.2
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
+REFRESH_SHARE = 16.0
+"""All predictions are renewed when so many times as many batches as since the last time were run before it."""
+
+MOST_UNREFRESHED = 128.0
+"""And at the latest after so many records, though a large tree may take longer."""
+
 PROVEN_VISITS = 2.0
 """Batches of its last operator from which on an earlier instance tells what rate a sequence had there."""
 
 UNPROVEN = 0.5
 """Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
+
+HARDLY_MORE = 1.01
+"""Half of the exploration goes into the sequence that would be the best, by this factor, if its first looks are believed."""
+
+BELIEVED_TRIES = 8.0
+"""Weight, in tries, of what an operator does on average where the first looks after a history are believed."""
+
+SETTLED = 4.0
+"""What was tried so many times as often as the average weighs is known: its own evidence is believed anyway."""
 
 CLEARLY_MORE = 1.05
 """By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
@@ -263,13 +281,16 @@ class _Outlook:
 class _Operator:
     """Pooled statistics of one conditional problem, and what they predict."""
 
-    __slots__ = ("guess", "hazards", "hopeful", "loops", "per_loop", "ready", "seconds_per_try", "statistics", "within")
+    __slots__ = (
+        "guess", "hazards", "hopeful", "loops", "per_loop", "ready", "seconds_per_try", "statistics", "trust", "within",
+    )  # fmt: skip
 
     def __init__(self, loops: int, per_loop: float, guess: float, outlook: _Outlook) -> None:
         self.statistics = Statistics()
         self.ready = True
         self.loops, self.per_loop = loops, per_loop  # guess of success
         self.guess = guess  # seconds per try
+        self.trust = outlook.trust
         self.predict(outlook)
 
     def predict(self, outlook: _Outlook) -> None:
@@ -280,7 +301,7 @@ class _Operator:
         self.seconds_per_try = known.seconds / known.tries if known.tries else outlook.slowness * self.guess
         self.within = _within(self.hazards)
         # After a history that was never tried: it may do as well as was guessed, whatever others did.
-        self.hopeful = _within([max(h, prior) for h in _hopeful(self.hazards, outlook.trust)])
+        self.hopeful = _within([max(h, prior) for h in _hopeful(self.hazards, self.trust)])
 
     def seconds_per_item(self, item_cost: float) -> float:
         """With as many tries as are worth making, when what is read costs so many seconds."""
@@ -308,13 +329,14 @@ class _History:
 
     tries: of a condition that are worth making. success, cost: expected, per condition. item_cost: expected device seconds
     per item of the component, with all that it was made of. prefixes: sequences by which it was made, none before.
-    borrowed: evidence of earlier instances. lean: what the success of each try was there, over the operator's: where an
+    believed_cost: the same if what was seen after the history itself is believed, however little it was. borrowed: evidence of
+    earlier instances. lean: what the success of each try was there, over the operator's: where an
     operator does worse on this instance, all its histories are expected to, without being tried one by one.
     """
 
     __slots__ = (
-        "borrowed", "cost", "hopeful_cost", "hopeful_success", "item_cost", "lean", "made", "operator", "prefixes", "reads",
-        "statistics", "success", "tries", "version",
+        "believed_cost", "borrowed", "cost", "hopeful_cost", "hopeful_success", "item_cost", "lean", "made", "operator",
+        "prefixes", "reads", "statistics", "success", "tries", "version",
     )  # fmt: skip
 
     def __init__(self, operator: _Operator, reads: tuple[_History, ...], made: State) -> None:
@@ -327,6 +349,7 @@ class _History:
         self.prefixes: list[Path] = []
         self.tries = 1
         self.success = self.cost = self.item_cost = self.hopeful_success = self.hopeful_cost = 0.0
+        self.believed_cost = 0.0
         self.version = -1
 
     def predict(self, trust: float) -> None:
@@ -348,6 +371,15 @@ class _History:
             item_cost = (read_cost + tries * per_try) / max(success, 1e-12)
             if item_cost < self.item_cost:
                 self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
+        self.believed_cost = self.item_cost
+        if own.attempts and own.attempts[0] < SETTLED * trust:
+            hazards_believed = own.hazards(expected, min(trust, BELIEVED_TRIES))
+        else:
+            hazards_believed = hazards
+        if hazards_believed is not hazards or any(read.believed_cost != read.item_cost for read in self.reads):
+            read_cost = sum(read.believed_cost for read in self.reads)
+            within = _within(hazards_believed)
+            self.believed_cost = min((read_cost + tries * per_try) / max(success, 1e-12) for success, tries in within)
         self.hopeful_success, tries = _within(_hopeful(hazards, known))[self.tries - 1]
         if own.tries + self.borrowed.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
             self.hopeful_success, tries = operator.hopeful[self.tries - 1]
@@ -514,7 +546,7 @@ class _Records:
         for read in history.reads:
             self._renewed(read)
         history.operator.predict(self._outlook)
-        history.predict(self._outlook.trust)
+        history.predict(history.operator.trust)
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
@@ -549,7 +581,11 @@ class _Records:
         return [history.prefixes[0] for history in histories if history.prefixes[0][-1].target == full]
 
     def _cheapest_paths(
-        self, k: int, among: Callable[[_Step], bool] = lambda step: True, only_made: bool = False
+        self,
+        k: int,
+        among: Callable[[_Step], bool] = lambda step: True,
+        only_made: bool = False,
+        cost_of: Callable[[_History], float] = attrgetter("item_cost"),
     ) -> dict[State, list[Path]]:
         """In every state the k partial sequences of least production cost, out of some steps, by a forward search.
 
@@ -569,7 +605,7 @@ class _Records:
                     history, kept = self._made_by(step, label[1])
                     if only_made and not history.prefixes:
                         continue
-                    cost = self._predicted(history).item_cost + sum([component.item_cost for component in kept])
+                    cost = cost_of(self._predicted(history)) + sum(map(cost_of, kept))
                     if len(others) < k or cost < max(others, key=itemgetter(0))[0]:
                         others.append((cost, (*kept, history), (step.transition, label)))
 
@@ -585,37 +621,53 @@ class _Records:
     def _predict_operators(self) -> None:
         """Renew what operators predict; histories follow when they are asked."""
         known = [operator for operator in self._operators.values() if operator.statistics.tries]
-        self._outlook = _Outlook(1.0 / self._correlation() - 1.0, _slowness(known), _ease(known))
+        general, of_operator = self._correlations()
+        self._outlook = _Outlook(_weight_of_mean(general), _slowness(known), _ease(known))
         for operator in self._operators.values():
+            operator.trust = _weight_of_mean(of_operator.get(operator, general))
             operator.predict(self._outlook)
         self._version += 1
 
-    def _correlation(self) -> float:
-        """Share of the variance of a first try's success that lies between the histories of one operator.
+    def _correlations(self) -> tuple[float, dict[_Operator, float]]:
+        """Share of the variance of a first try's success that lies between the histories of one operator: over all operators,
+        and of each one.
 
-        With success distributed over histories as a beta distribution, 1/share - 1 is the weight of its mean, in tries.
-        Estimated by moments over all operators: the squared deviations from their means beyond the binomial ones.
+        With success distributed over histories as a beta distribution. Estimated by moments: the squared differences between a
+        history and the others of its operator, beyond the binomial ones. Not from the operator's mean: where nearly all tries
+        were after one history that is its own. What is seen of one operator is added to what all say.
         """
-        between, total = CORRELATION * CORRELATION_TRIES, CORRELATION_TRIES
-        for history in self._known:
+        tried = [h for h in self._known if h.statistics.attempts and h.statistics.attempts[0] > 1.0]
+        squares: dict[_Operator, float] = {}
+        for history in tried:
+            squares[history.operator] = squares.get(history.operator, 0.0) + history.statistics.attempts[0] ** 2
+        moments: dict[_Operator, tuple[float, float]] = {}  # weighted sum and weight, in tries
+        for history in tried:
             own, pooled = history.statistics, history.operator.statistics
-            if own.attempts and own.attempts[0] > 1.0 and own.attempts[0] < pooled.attempts[0]:
-                tries, mean = own.attempts[0], pooled.successes[0] / pooled.attempts[0]
-                variance = mean * (1.0 - mean)
-                if variance > 0.0:
-                    deviation = (own.successes[0] / tries - mean) ** 2 / variance
-                    # No history counts for more than the guess.
-                    weight = min(tries, CORRELATION_TRIES)
-                    # The mean contains the history itself.
-                    between += weight * (deviation / (1.0 - tries / pooled.attempts[0]) - 1.0 / tries)
-                    total += weight
-        return min(max(between / total, 1e-3), 0.5)
+            tries = own.attempts[0]
+            others, mean = pooled.attempts[0] - tries, pooled.successes[0] / pooled.attempts[0]
+            variance = mean * (1.0 - mean)
+            if others > 1.0 and variance > 0.0:
+                difference = own.successes[0] / tries - (pooled.successes[0] - own.successes[0]) / others
+                # The others' mean varies between histories too, the less the more of them there are.
+                parts = 1.0 + max(squares[history.operator] - tries**2, 0.0) / others**2
+                # No history counts for more than the guess.
+                weight = min(tries, others, CORRELATION_TRIES)
+                between = (difference**2 / variance - 1.0 / tries - 1.0 / others) / min(parts, 2.0)
+                so_far = moments.get(history.operator, (0.0, 0.0))
+                moments[history.operator] = so_far[0] + weight * between, so_far[1] + weight
+        between, total = (sum(values) for values in zip((0.0, 0.0), *moments.values()))
+        general = (CORRELATION * CORRELATION_TRIES + between) / (CORRELATION_TRIES + total)
+        of_operator = {
+            operator: (general * OWN_CORRELATION_TRIES + between) / (OWN_CORRELATION_TRIES + total)
+            for operator, (between, total) in moments.items()
+        }
+        return general, of_operator
 
     def _predicted(self, history: _History) -> _History:
         if history.version != self._version:
             for read in history.reads:
                 self._predicted(read)
-            history.predict(self._outlook.trust)
+            history.predict(history.operator.trust)
             history.version = self._version
         return history
 
@@ -877,6 +929,8 @@ class Tree(_Records):
         self._earlier_batches = 0.0  # of an earlier instance
         self._incumbent: Path = ()
         self._promised: Path = ()
+        self._believed: Path = ()
+        self._advantage = 0.0  # greatest predicted rate over the incumbent's, at the last refresh of a small graph
         self._of_incumbent: frozenset[_History] = frozenset()
         self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
         self._epoch = 0  # of the values: they change with the price too
@@ -928,6 +982,9 @@ class Tree(_Records):
         if not incumbent or self._any_unready and not all(self._is_ready(self._step(t)) for t in incumbent):
             return self._promising(price)
         exploring = self._total.explored < self._allowed_to_explore
+        if exploring and self._believed and self._choices % 2:
+            # Half of the exploration tells whether what did well at its first looks goes on to.
+            return self._believed
         if exploring or self._states is None:
             path = self._promising(price)
             if exploring and path != incumbent:
@@ -942,6 +999,8 @@ class Tree(_Records):
         # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
             more = EARLIER_PROMISE
+        if self._states is not None and self._advantage <= more:
+            return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
         if self._rate_now(path) > more * self._rate_now(incumbent):
             self._promised = path
@@ -1128,13 +1187,15 @@ class Tree(_Records):
         first_time = made.statistics.visits <= 1.0 and (
             made.operator.statistics.visits <= made.statistics.visits or made.made == self.transitions.full
         )
-        # A refresh visits every edge of the tree: its cost is spread over a proportional number of records.
-        if first_time or self._records_since_refresh > max(48, self._edges_evaluated // 16):
+        # A refresh visits every edge of the tree: its cost is spread over a proportional number of records. Early ones change
+        # more than late ones.
+        share = min(self._total.visits / REFRESH_SHARE, MOST_UNREFRESHED)
+        if first_time or self._records_since_refresh > max(DISAPPOINTED, share, self._edges_evaluated // 16):
             self._stale = True
         if self._stale:
             return
         made.operator.predict(self._outlook)
-        made.predict(self._outlook.trust)
+        made.predict(made.operator.trust)
         price = self.price
         for edge, node in zip(reversed(lineage), reversed([self._root, *map(self._behind, lineage[:-1])])):
             self._evaluate_edge(edge, price)
@@ -1167,6 +1228,13 @@ class Tree(_Records):
                 self._attainable = attainable
                 self._value_at(self.price)
         self._renew_incumbent()
+        best: Path = next(iter(self._prefixes.get(self.transitions.full, ())), ())
+        if best and self._incumbent:
+            self._advantage = self._rate_of(best) / self._rate_of(self._incumbent)
+            believed = self._cheapest_paths(1, lambda step: step.operator.ready, cost_of=attrgetter("believed_cost"))
+            path, (components, _) = believed[self.transitions.full][0], self._made_along(believed[self.transitions.full][0])
+            rate = 1.0 / max(sum(history.believed_cost for history in components), 1e-300)
+            self._believed = path if rate > HARDLY_MORE * self._rate_of(self._incumbent) else ()
         self._records_since_refresh = 0
         self._stale = False
 
@@ -1376,6 +1444,11 @@ class Random(_Records):
             path.append(self._generator.choice(available))
             state = path[-1].target
         return tuple(path)
+
+
+def _weight_of_mean(correlation: float) -> float:
+    """Weight, in tries, of an operator's mean success in what is expected after a history (`_Records._correlations`)."""
+    return 1.0 / min(max(correlation, 1e-3), 0.5) - 1.0
 
 
 def _slowness(operators: Iterable[_Operator]) -> float:
