@@ -635,6 +635,49 @@ def test_weight_of_pooled_statistics_is_learned(spread):
     assert tree._correlations()[0] == pytest.approx(expected, abs=0.02)
 
 
+def test_one_history_with_nearly_all_tries_does_not_hide_that_histories_matter():
+    """Half of the histories succeed in 0.65, half in 0.35 of the tries, the one with nearly all tries in 0.65."""
+    transitions = Transitions(regrasps(3))
+    tree = Fixed(transitions, next(transitions.sequences()), discount=1.0)
+    generator = np.random.default_rng(0)
+    seen: dict = {}
+    for path, _ in zip(transitions.sequences(), range(4000)):
+        for i, step in enumerate(path):
+            history = tree._follow(path[: i + 1])[-1].history
+            if history not in seen and len(seen) < 400:
+                dominates = history.operator not in {other.operator for other in seen}
+                seen[history] = 0.65 if dominates else 0.5 + 0.15 * generator.choice([-1, 1])
+                tries = 200_000 if dominates else 30
+                tree.record(path[:i], step, tries, int(generator.binomial(tries, seen[history])), 0.1)
+    assert tree._correlations()[0] == pytest.approx(0.15**2 / 0.25, abs=0.015)
+
+
+def test_half_of_the_exploration_goes_into_what_did_well_at_its_first_looks():
+    """q2 succeeds in a tenth after t; q1, and in a quarter of the first 40 tries after (t,q1)."""
+    transitions = Transitions(pick_place())
+    usual, lucky = transitions.parse("t; q1; q2"), transitions.parse("(t,q1); q2")
+    tree = Tree(transitions, discount=1.0)
+    for _ in range(20):
+        tree.record((), usual[0], 1000, 1000, 0.01)
+        tree.record(usual[:1], usual[1], 1000, 500, 1.0)
+        tree.record(usual[:2], usual[2], 1000, 100, 1.0)
+    tree.record((), lucky[0], 100_000, 20_000, 100.0)
+    tree.record(lucky[:1], lucky[1], 40, 10, 0.04)
+    tree._refresh()
+    (history,), _ = tree._made_along(lucky)
+    average = (20 * 100 + 10) / (20 * 1000 + 40)
+    believed = (10 + 8 * average) / (40 + 8)
+    assert history.believed_cost == pytest.approx((5e-3 + 1e-3) / believed, rel=1e-5)
+    assert history.item_cost > 1.05 * history.believed_cost
+    tree._incumbent, tree._of_incumbent = usual, frozenset(tree._made_along(usual)[1])
+    tree._believed, tree._advantage, tree._stale = lucky, 0.0, False
+    tree._total.batches, tree._total.first_trials = 100.0, 1e9  # time to explore, none for operators that never ran
+    tree._total.explored = 0.0
+    assert [tree.select() for _ in range(20)].count(lucky) >= 10
+    tree._total.explored = 1e9
+    assert [tree.select() for _ in range(20)].count(usual) == 20
+
+
 class HistoryWorld:
     """Success belongs to histories: about the operator's, with the scatter seen on real scenes. Pools as the sampler has."""
 
