@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,8 @@ def instances(scene: Mapping[str, Any], path: Path) -> None:
         axis.set_yscale("log")
         axis.set_ylim(bottom=floor)
         axis.grid(axis="x", visible=False)
-        axis.set_xticks(range(len(scene["instances"])), [f"{i['instance']}: {i['title']}" for i in scene["instances"]])
+        names = [textwrap.fill(f"{instance['instance']}: {instance['title']}", 16) for instance in scene["instances"]]
+        axis.set_xticks(range(len(names)), names)
         if len(scene["instances"]) > 5:
             axis.tick_params(axis="x", labelsize=8)
         axis.set(ylabel="final samples/s (log)", title=f"{scene['title']}: final rate by instance; a dot is a seed")
@@ -153,6 +155,8 @@ def coverage(scene: Mapping[str, Any], path: Path) -> None:
             axis.axhline(1.0, color=COLOURS["tree"], lw=0.9, ls=":")
             axis.grid(axis="x", visible=False)
             axis.set(title=title, ylabel="over tree's")
+            if what == "distance_at_equal_time":  # from half of tree's to hundreds of times
+                axis.set_yscale("log")
         names = []
         for variable in scene["variables"]:
             fill = np.mean([instance["variables"][variable]["fill"] for instance in covered])
@@ -160,7 +164,7 @@ def coverage(scene: Mapping[str, Any], path: Path) -> None:
         axes[-1].set_xticks(range(len(names)), names)
         handles = [plt.Rectangle((0, 0), 1, 1, color=colour, alpha=0.9) for colour in colours.values()]
         figure.legend(handles, list(colours), ncols=len(colours), loc="outside lower center")
-        figure.suptitle(f"{scene['title']}: coverage; whiskers: 95 % bootstrap over instances and seeds")
+        figure.suptitle(f"{scene['title']}: coverage\nwhiskers: 95 % bootstrap over instances and seeds")
         _save(figure, path)
 
 
