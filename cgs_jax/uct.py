@@ -352,10 +352,9 @@ class _History:
         self.believed_cost = 0.0
         self.version = -1
 
-    def predict(self, trust: float) -> None:
-        """trust: as for operators."""
+    def predict(self) -> None:
         operator, own = self.operator, self.statistics
-        expected = operator.hazards
+        expected, trust = operator.hazards, operator.trust
         if self.lean:
             expected = [min(h * self.lean[min(k, len(self.lean) - 1)], 1.0) for k, h in enumerate(expected)]
             trust += self.borrowed.attempts[0]
@@ -546,7 +545,7 @@ class _Records:
         for read in history.reads:
             self._renewed(read)
         history.operator.predict(self._outlook)
-        history.predict(history.operator.trust)
+        history.predict()
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
@@ -667,7 +666,7 @@ class _Records:
         if history.version != self._version:
             for read in history.reads:
                 self._predicted(read)
-            history.predict(history.operator.trust)
+            history.predict()
             history.version = self._version
         return history
 
@@ -929,7 +928,7 @@ class Tree(_Records):
         self._earlier_batches = 0.0  # of an earlier instance
         self._incumbent: Path = ()
         self._promised: Path = ()
-        self._believed: Path = ()
+        self._believed: Path = ()  # would be better than the incumbent if its first looks told the truth
         self._advantage = 0.0  # greatest predicted rate over the incumbent's, at the last refresh of a small graph
         self._of_incumbent: frozenset[_History] = frozenset()
         self._prefixes: dict[State, list[Path]] = {}  # to every state of a small graph the cheapest one
@@ -1195,7 +1194,7 @@ class Tree(_Records):
         if self._stale:
             return
         made.operator.predict(self._outlook)
-        made.predict(made.operator.trust)
+        made.predict()
         price = self.price
         for edge, node in zip(reversed(lineage), reversed([self._root, *map(self._behind, lineage[:-1])])):
             self._evaluate_edge(edge, price)
@@ -1228,15 +1227,21 @@ class Tree(_Records):
                 self._attainable = attainable
                 self._value_at(self.price)
         self._renew_incumbent()
-        best: Path = next(iter(self._prefixes.get(self.transitions.full, ())), ())
-        if best and self._incumbent:
-            self._advantage = self._rate_of(best) / self._rate_of(self._incumbent)
-            believed = self._cheapest_paths(1, lambda step: step.operator.ready, cost_of=attrgetter("believed_cost"))
-            path, (components, _) = believed[self.transitions.full][0], self._made_along(believed[self.transitions.full][0])
-            rate = 1.0 / max(sum(history.believed_cost for history in components), 1e-300)
-            self._believed = path if rate > HARDLY_MORE * self._rate_of(self._incumbent) else ()
+        self._compare_with_incumbent()
         self._records_since_refresh = 0
         self._stale = False
+
+    def _compare_with_incumbent(self) -> None:
+        """What others promise over the incumbent, by all predictions and if first looks are believed. For small graphs."""
+        full = self.transitions.full
+        if not self._incumbent or not self._prefixes.get(full):
+            return
+        rate = self._rate_of(self._incumbent)
+        self._advantage = self._rate_of(self._prefixes[full][0]) / rate
+        (path,) = self._cheapest_paths(1, lambda step: step.operator.ready, cost_of=attrgetter("believed_cost"))[full]
+        components, _ = self._made_along(path)
+        believed_cost = sum(history.believed_cost for history in components)
+        self._believed = path if believed_cost * HARDLY_MORE * rate < 1.0 else ()
 
     def _greatest_rate(self) -> float:
         """Predicted rate of the best of all sequences that are ready; 0 without one. For small graphs."""

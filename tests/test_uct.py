@@ -19,6 +19,12 @@ def pair_graph() -> Transitions:
     return Transitions(ConstraintGraph("pair", variables, (Constraint("L", "Link", ("a", "b"), 1, 0),)))
 
 
+def settle_on(tree, path, advantage):
+    """Makes a sequence the incumbent, whatever was recorded; advantage: of the best other one, in rate over its."""
+    tree._incumbent, tree._of_incumbent = path, frozenset(tree._made_along(path)[1])
+    tree._advantage = advantage
+
+
 def join_graph() -> Transitions:
     """a and b are independent until c joins them."""
     variables = tuple(Variable(name, 2, "vector") for name in "abc")
@@ -493,8 +499,7 @@ def test_what_disappoints_at_its_first_steps_is_given_up_before_its_last():
     for _ in range(100):
         tree.record((), joint[0], 100, 5, 1.0)
     tree._refresh()
-    tree._incumbent, tree._of_incumbent = joint, frozenset(tree._made_along(joint)[1])
-    tree._advantage = 10.0
+    settle_on(tree, joint, advantage=10.0)
     tree._total.explored = 1e9  # no time to explore
     tree._choices = 0
     assert tree.select() == alone
@@ -514,8 +519,7 @@ def test_what_promises_hardly_more_than_the_incumbent_is_not_looked_for_again_so
         tree.record((), alone[0], 1000, 1000, 10.0)
         tree.record(alone[:1], alone[1], 1000, 1000, 8.87)
     tree._refresh()
-    tree._incumbent, tree._of_incumbent = joint, frozenset(tree._made_along(joint)[1])
-    tree._advantage = tree._rate_of(alone) / tree._rate_of(joint)
+    settle_on(tree, joint, advantage=tree._rate_of(alone) / tree._rate_of(joint))
     assert 1.05 < tree._advantage < PROMISE
     tree._total.explored = 1e9  # no time to explore
     for _ in range(DISAPPOINTED + 8):
@@ -669,8 +673,8 @@ def test_half_of_the_exploration_goes_into_what_did_well_at_its_first_looks():
     believed = (10 + 8 * average) / (40 + 8)
     assert history.believed_cost == pytest.approx((5e-3 + 1e-3) / believed, rel=1e-5)
     assert history.item_cost > 1.05 * history.believed_cost
-    tree._incumbent, tree._of_incumbent = usual, frozenset(tree._made_along(usual)[1])
-    tree._believed, tree._advantage, tree._stale = lucky, 0.0, False
+    settle_on(tree, usual, advantage=0.0)
+    tree._believed, tree._stale = lucky, False
     tree._total.batches, tree._total.first_trials = 100.0, 1e9  # time to explore, none for operators that never ran
     tree._total.explored = 0.0
     assert [tree.select() for _ in range(20)].count(lucky) >= 10
