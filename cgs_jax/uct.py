@@ -98,11 +98,14 @@ PRICE_STEPS = 2
 CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
+KEEN_CURIOSITY = 0.1
+"""Those of operators that may make the best sequence may take so much, unless the start was warm."""
+
+UNTRIED_HOPE = 6.0
+"""What never ran may succeed so many times as often as guessed: on the scenes here hardly any does better."""
+
 TRIAL_SECONDS = 0.1
 """What a first trial takes a worker, with the reading of programs: after a warm start so much must have been saved for it."""
-
-CURIOUS_AFTER = 30
-"""Batches per operator of the graph, after which those that seem hopeless by what they cost have a first trial too."""
 
 CURIOUS_EVERY = 4
 """Only one choice in so many asks for a first trial: what it reads may have to be made before, and that takes time too."""
@@ -139,6 +142,9 @@ HARDLY_MORE = 1.01
 
 BELIEVED_TRIES = 8.0
 """Weight, in tries, of what an operator does on average where the first looks after a history are believed."""
+
+BELIEVED_LABELS = 3
+"""Partial sequences that are kept in every state in the search for that one: the best one need not begin with the cheapest."""
 
 SETTLED = 4.0
 """What was tried so many times as often as the average weighs is known: its own evidence is believed anyway."""
@@ -549,16 +555,17 @@ class _Records:
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
-        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end.
-
-        The best ones may differ only in the order of independent steps, and then have equal rates.
-        """
+        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; of those that
+        differ only in the order of independent steps one."""
         self._predict_operators()
         paths = self._finished_paths(self._known)
         if self._states is not None:
             # The cheapest way to a state may be one that was not gone on, and then takes the place of one that was.
-            paths = list(dict.fromkeys([*self._cheapest_paths(k, only_made=True)[self.transitions.full], *paths]))
-        ranked = sorted(((path, self._rate_of(path)) for path in paths), key=lambda pair: -pair[1])
+            paths = [*self._cheapest_paths(k, only_made=True)[self.transitions.full], *paths]
+        distinct: dict[frozenset[_History], Path] = {}
+        for path in paths:
+            distinct.setdefault(frozenset(self._made_along(path)[0]), path)
+        ranked = sorted(((path, self._rate_of(path)) for path in distinct.values()), key=lambda pair: -pair[1])
         return ranked[:k]
 
     def _rate_of(self, path: Path) -> float:
@@ -594,8 +601,11 @@ class _Records:
         partial: dict[State, list[tuple[float, tuple[_History, ...], Any]]] = {state: [] for state in self._states}
         partial[frozenset()] = [(0.0, (), None)]
         for state in self._states:
-            labels = sorted(partial[state], key=itemgetter(0))[:k]
-            partial[state] = labels
+            # Sequences that differ only in the order of independent steps end with the same components.
+            distinct: dict[frozenset[_History], tuple[float, tuple[_History, ...], Any]] = {}
+            for label in sorted(partial[state], key=itemgetter(0)):
+                distinct.setdefault(frozenset(label[1]), label)
+            labels = partial[state] = list(distinct.values())[:k]
             for step in self._steps_from(state).values():
                 if not among(step):
                     continue
@@ -605,8 +615,7 @@ class _Records:
                     if only_made and not history.prefixes:
                         continue
                     cost = cost_of(self._predicted(history)) + sum(map(cost_of, kept))
-                    if len(others) < k or cost < max(others, key=itemgetter(0))[0]:
-                        others.append((cost, (*kept, history), (step.transition, label)))
+                    others.append((cost, (*kept, history), (step.transition, label)))
 
         def path_to(label: Any) -> Path:
             path: list[Transition] = []
@@ -925,6 +934,8 @@ class Tree(_Records):
         self._per_variable: dict[str, tuple[float, float]] = {}  # of a large graph
         self._attainable = 0.0  # samples per second
         self._choices = 0
+        self._untried_at = -1  # epoch
+        self._untried: tuple[float, Path] = (-math.inf, ())
         self._earlier_batches = 0.0  # of an earlier instance
         self._incumbent: Path = ()
         self._promised: Path = ()
@@ -973,10 +984,9 @@ class Tree(_Records):
             self._refresh()
         price = self.price
         self._choices += 1
-        if self._curious:
-            untried = self._path_to_untried()
-            if untried:
-                return untried
+        untried = self._path_to_untried() if self._curious else ()
+        if untried:
+            return untried
         incumbent = self._incumbent
         if not incumbent or self._any_unready and not all(self._is_ready(self._step(t)) for t in incumbent):
             return self._promising(price)
@@ -1059,31 +1069,47 @@ class Tree(_Records):
 
     @property
     def _curious(self) -> bool:
-        if self._states is None or self._choices % CURIOUS_EVERY:
-            return False
-        at_once = not self._earlier_batches
-        return self._total.first_trials + (0.0 if at_once else TRIAL_SECONDS) <= CURIOSITY * self._total.spent
+        """Is it time to ask for a first trial?"""
+        return self._states is not None and not self._choices % CURIOUS_EVERY and self._may_try(KEEN_CURIOSITY)
+
+    def _may_try(self, share: float) -> bool:
+        """Did first trials take less than that share of the time?"""
+        if self._earlier_batches:
+            return self._total.first_trials + TRIAL_SECONDS <= CURIOSITY * self._total.spent
+        return self._total.first_trials <= share * self._total.spent
 
     def _path_to_untried(self) -> Path:
-        """A sequence with an operator that never ran: the smallest one after the cheapest prefix; () where all have run.
+        """A sequence with the operator that never ran and promises most; () where all have run or it is too early.
 
-        One that costs more per try, with all that it reads, than a sample of the best sequence is hopeless and comes last.
+        What it promises is the rate of the best sequence with it, if it succeeds `UNTRIED_HOPE` times as often as guessed and
+        everything else as is expected.
         """
-        found: tuple[tuple[float, int], Path] | None = None
-        patient = self._total.visits < CURIOUS_AFTER * len(self._representatives)
-        most = 1.0 / self.price if patient and self.price else math.inf
+        if self._untried_at != self._epoch:
+            self._untried_at, self._untried = self._epoch, self._most_promising_untried()
+        promise, path = self._untried
+        return path if promise > 0.0 or self._may_try(CURIOSITY) else ()
+
+    def _most_promising_untried(self) -> tuple[float, Path]:
+        """1 - price * seconds per sample of that sequence, below 0 where it is worse than the best one; and the sequence."""
+        price = self.price
+        below = self._values_of_states(price, attrgetter("within"))
+        best: tuple[float, Path] = (-math.inf, ())
         for state, steps in self._backwards:
-            for path in self._prefixes.get(state, []):
+            untried = [(s, kept) for s, kept in steps if s.operator.ready and not s.operator.statistics.visits]
+            for path in self._prefixes.get(state, []) if untried else ():
                 components, _ = self._made_along(path)
-                for step, _ in steps:
-                    operator = step.operator
-                    if operator.statistics.visits or not operator.ready:
+                cost_of = {component.made: self._predicted(component).item_cost for component in components}
+                for step, kept in untried:
+                    operator, beyond = step.operator, below[step.target]
+                    if beyond is None:
                         continue
-                    reads = sum(self._predicted(c).item_cost for c in components if c.made in step.used)
-                    size = operator.guess, len(path)
-                    if reads + operator.seconds_per_try < most and (found is None or size < found[0]):
-                        found = size, (*path, step.transition)
-        return self._completed(found[1]) if found else ()
+                    success = min(UNTRIED_HOPE * operator.hazards[0], SUCCESS_BOUNDS[1])
+                    at_stake = (1.0 - success) * sum(cost_of[component] for component in kept)
+                    cost = sum(cost_of.values()) + operator.seconds_per_try - at_stake
+                    promise = (success * beyond[0] - price * cost) / max(success * beyond[1], 1e-12)
+                    if promise > best[0]:
+                        best = promise, (*path, step.transition)
+        return (best[0], self._completed(best[1])) if best[1] else best
 
     def _completed(self, path: Path) -> Path:
         """The sequence with the steps of greatest value behind, by operators alone."""
@@ -1238,7 +1264,9 @@ class Tree(_Records):
             return
         rate = self._rate_of(self._incumbent)
         self._advantage = self._rate_of(self._prefixes[full][0]) / rate
-        (path,) = self._cheapest_paths(1, lambda step: step.operator.ready, cost_of=attrgetter("believed_cost"))[full]
+        path = self._cheapest_paths(
+            BELIEVED_LABELS, lambda step: step.operator.ready, cost_of=attrgetter("believed_cost")
+        )[full][0]
         components, _ = self._made_along(path)
         believed_cost = sum(history.believed_cost for history in components)
         self._believed = path if believed_cost * HARDLY_MORE * rate < 1.0 else ()
@@ -1252,9 +1280,10 @@ class Tree(_Records):
         """Values of all states and nodes at a price of time."""
         self._epoch += 1
         self._edges_evaluated = 0
-        self._below = {self.transitions.full: (1.0, 1.0)}
         if self._states is not None:
-            self._solve_states(price)
+            self._below = self._values_of_states(price, attrgetter("hopeful"))
+        else:
+            self._below = {self.transitions.full: (1.0, 1.0)}
         self._evaluate(self._root, price)
 
     def _rate_of_the_best(self) -> float:
@@ -1294,10 +1323,13 @@ class Tree(_Records):
         edge.quality = success * edge.value - price * cost
         edge.reach = success * reach
 
-    def _solve_states(self, price: float) -> None:
-        """Dynamic programming over states with the operators' statistics, for what lies below the tree.
+    def _values_of_states(
+        self, price: float, outcomes: Callable[[_Operator], list[tuple[float, float]]]
+    ) -> dict[State, tuple[float, float] | None]:
+        """Value and reach by state, from operators alone: dynamic programming on a small graph. None where nothing is ready.
 
-        First the least cost per item of every component that can be made, then the values backwards.
+        First the least cost per item of every component that can be made, then the values backwards. outcomes: success of an
+        operator and mean number of tries, within one try, two tries and so on.
         """
         costs: dict[State, float] = {}
         for step, _ in self._by_made:
@@ -1305,20 +1337,21 @@ class Tree(_Records):
                 cost = step.operator.seconds_per_item(sum(costs.get(component, math.inf) for component in step.used))
                 if cost < costs.get(step.made, math.inf):
                     costs[step.made] = cost
-        below = self._below
+        values: dict[State, tuple[float, float] | None] = {self.transitions.full: (1.0, 1.0)}
         for state, steps in self._backwards:
             best = None
             for step, kept in steps:
-                operator, beyond = step.operator, below[step.target]
+                operator, beyond = step.operator, values[step.target]
                 if beyond is None or not operator.ready:
                     continue
                 at_stake = sum(costs.get(component, 0.0) for component in kept)
-                for success, tries in operator.hopeful:
+                for success, tries in outcomes(operator):
                     cost = tries * operator.seconds_per_try - (1.0 - success) * at_stake
                     quality = success * beyond[0] - price * cost
                     if best is None or quality > best[0]:
                         best = quality, success * beyond[1]
-            below[state] = best
+            values[state] = best
+        return values
 
     def _with_kept(self, state: State) -> list[tuple[_Step, tuple[State, ...]]]:
         """The steps out of a state with the components that their failure leaves."""
