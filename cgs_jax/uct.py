@@ -98,18 +98,23 @@ PRICE_STEPS = 2
 CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
-KEEN_CURIOSITY = 0.1
+KEEN_CURIOSITY = 0.15
 """Those of operators that may make the best sequence may take so much, unless the start was warm."""
 
-UNTRIED_HOPE = 6.0
-"""What never ran may succeed so many times as often as guessed: on the scenes here hardly any does better."""
+SURPRISE = 0.5
+"""Guess by how much, in logarithms, operators do better than guessed (`_surprise`)."""
+
+SURPRISE_OPERATORS = 4.0
+"""Weight of that guess, in operators."""
+
+UNTRIED_HOPE = 2.5
+"""What never ran may do better than guessed by so many times what is usual."""
 
 TRIAL_SECONDS = 0.1
 """What a first trial takes a worker, with the reading of programs: after a warm start so much must have been saved for it."""
 
 CURIOUS_EVERY = 4
 """Only one choice in so many asks for a first trial: what it reads may have to be made before, and that takes time too."""
-
 
 EXPLORATION = 20.0
 """Batches that may go into sequences which promise hardly more than the incumbent, the best one that was run to the end, for
@@ -276,12 +281,13 @@ class _Outlook:
     """What all operators of a run say of those that have not run.
 
     trust: weight of an operator's pooled success in what is expected after a history, in tries. slowness: device seconds over
-    guessed ones. ease: success over the guessed one, per loop.
+    guessed ones. ease: success over the guessed one, per loop. surprise: by how much those that do better than guessed do so.
     """
 
     trust: float = 1.0 / CORRELATION - 1.0
     slowness: float = 1.0
     ease: float = 1.0
+    surprise: float = SURPRISE
 
 
 class _Operator:
@@ -301,13 +307,17 @@ class _Operator:
 
     def predict(self, outlook: _Outlook) -> None:
         known = self.statistics
-        prior = min(outlook.ease * self.per_loop, SUCCESS_BOUNDS[1]) ** self.loops if self.loops else self.per_loop
+        prior = self.guessed(outlook.ease)
         self.hazards = known.hazards([prior], PRIOR_TRIES)
         # The guessed cost counts only until a cost was seen: it may be wrong by orders of magnitude.
         self.seconds_per_try = known.seconds / known.tries if known.tries else outlook.slowness * self.guess
         self.within = _within(self.hazards)
         # After a history that was never tried: it may do as well as was guessed, whatever others did.
         self.hopeful = _within([max(h, prior) for h in _hopeful(self.hazards, self.trust)])
+
+    def guessed(self, ease: float) -> float:
+        """Success by dof and rows and by how the others do."""
+        return min(ease * self.per_loop, SUCCESS_BOUNDS[1]) ** self.loops if self.loops else self.per_loop
 
     def seconds_per_item(self, item_cost: float) -> float:
         """With as many tries as are worth making, when what is read costs so many seconds."""
@@ -630,7 +640,8 @@ class _Records:
         """Renew what operators predict; histories follow when they are asked."""
         known = [operator for operator in self._operators.values() if operator.statistics.tries]
         general, of_operator = self._correlations()
-        self._outlook = _Outlook(_weight_of_mean(general), _slowness(known), _ease(known))
+        ease = _ease(known)
+        self._outlook = _Outlook(_weight_of_mean(general), _slowness(known), ease, _surprise(known, ease))
         for operator in self._operators.values():
             operator.trust = _weight_of_mean(of_operator.get(operator, general))
             operator.predict(self._outlook)
@@ -1081,8 +1092,8 @@ class Tree(_Records):
     def _path_to_untried(self) -> Path:
         """A sequence with the operator that never ran and promises most; () where all have run or it is too early.
 
-        What it promises is the rate of the best sequence with it, if it succeeds `UNTRIED_HOPE` times as often as guessed and
-        everything else as is expected.
+        What it promises is the rate of the best sequence with it, if it does better than guessed as those do that do so
+        (`UNTRIED_HOPE`), and everything else as is expected.
         """
         if self._untried_at != self._epoch:
             self._untried_at, self._untried = self._epoch, self._most_promising_untried()
@@ -1093,6 +1104,7 @@ class Tree(_Records):
         """1 - price * seconds per sample of that sequence, below 0 where it is worse than the best one; and the sequence."""
         price = self.price
         below = self._values_of_states(price, attrgetter("within"))
+        hope = math.exp(UNTRIED_HOPE * self._outlook.surprise)
         best: tuple[float, Path] = (-math.inf, ())
         for state, steps in self._backwards:
             untried = [(s, kept) for s, kept in steps if s.operator.ready and not s.operator.statistics.visits]
@@ -1103,7 +1115,7 @@ class Tree(_Records):
                     operator, beyond = step.operator, below[step.target]
                     if beyond is None:
                         continue
-                    success = min(UNTRIED_HOPE * operator.hazards[0], SUCCESS_BOUNDS[1])
+                    success = min(hope * operator.hazards[0], SUCCESS_BOUNDS[1])
                     at_stake = (1.0 - success) * sum(cost_of[component] for component in kept)
                     cost = sum(cost_of.values()) + operator.seconds_per_try - at_stake
                     promise = (success * beyond[0] - price * cost) / max(success * beyond[1], 1e-12)
@@ -1505,6 +1517,18 @@ def _ease(operators: Iterable[_Operator]) -> float:
             total += math.log(success) - operator.loops * math.log(operator.per_loop)
             loops += operator.loops
     return math.exp(total / loops)
+
+
+def _surprise(operators: Iterable[_Operator], ease: float) -> float:
+    """Root mean square of the logarithm of success over the guessed one, of operators that did better than guessed."""
+    total, count = SURPRISE_OPERATORS * SURPRISE**2, SURPRISE_OPERATORS
+    for operator in operators:
+        known = operator.statistics
+        if operator.loops and known.attempts[0] >= VISIT_TRIES:
+            more = math.log((known.successes[0] + 0.5) / (known.attempts[0] + 1.0) / operator.guessed(ease))
+            if more > 0.0:
+                total, count = total + more**2, count + 1.0
+    return math.sqrt(total / count)
 
 
 def guessed_success(graph: ConstraintGraph, problem: Problem) -> tuple[int, float]:
