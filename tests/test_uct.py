@@ -20,6 +20,8 @@ from cgs_jax.uct import (
     Random,
     Statistics,
     Tree,
+    _surprise,
+    guessed_success,
 )
 
 
@@ -571,6 +573,19 @@ def test_of_the_operators_that_never_ran_the_one_that_may_make_the_best_sequence
     assert tree.select() == usual
     tree._total.first_trials, tree._choices = 0.5 * CURIOSITY, CURIOUS_EVERY - 1
     assert tree.select()[0].new == ("q2", "t")
+
+
+def test_hope_for_what_never_ran_grows_with_how_far_the_others_exceed_the_guess():
+    """Four operators' weight of 0.5, and one of a logarithm of 2; one that does worse than guessed says nothing."""
+    transitions = Transitions(pick_place())
+    tree = Tree(transitions)
+    assert _surprise([], 1.0) == 0.5
+    (q1, _), (q2, _) = transitions.parse("(q1,t); q2"), transitions.parse("(q2,t); q1")
+    tree.record((), q1, 10**6, round(10**6 * 0.05 * math.exp(2.0)), 1.0)
+    tree.record((), q2, 10**6, 10, 1.0)
+    ease = 0.05 / guessed_success(transitions.graph, q1.problem)[1]
+    known = [operator for operator in tree._operators.values() if operator.statistics.tries]
+    assert _surprise(known, ease) == pytest.approx(math.sqrt((4 * 0.25 + 4.0) / 5), rel=1e-4)
 
 
 def test_random_is_uniform_over_children_and_repeatable():
