@@ -73,6 +73,17 @@ def test_half_the_space_is_half_the_coverage():
     assert np.mean(ratios) == pytest.approx(1.0) and len(ratios) == 2
 
 
+def test_methods_are_compared_over_the_seeds_that_both_have():
+    """The machine was slow when tree's third seed ran."""
+    assert measures.side_by_side([4.0, 6.0, 1.0], [2.0, 2.0]) == ([4.0, 6.0], [2.0, 2.0])
+    cells = {"tree": {"cells": [40, 60, 10]}, "expert": {"cells": [20, 30]}}
+    assert measures.relative_to_tree([{"variables": {"x": {"methods": cells}}}], "x", "expert", "cells") == [0.4, 0.6]
+    methods = {"tree": {"final": [4.0, 6.0, 1.0]}, "expert": {"final": [2.0, 2.0]}}
+    scene = {"sequences": {"expert": ""}, "instances": [{"instance": 0, "methods": methods}]}
+    (entry,) = claims.expert_ratios(scene)
+    assert entry["ratio"] == pytest.approx(2.5)
+
+
 # ------------------------------------------------------------------ sequences
 
 

@@ -52,11 +52,11 @@ def best_expert(scene: Mapping[str, Any], instance: Mapping[str, Any]) -> str:
 
 
 def expert_ratios(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Per instance: the best expert and tree's final rate over its, with interval."""
+    """Per instance: the best expert and tree's final rate over its, of the seeds that both have, with interval."""
     result = []
     for instance in scene["instances"]:
         expert = best_expert(scene, instance)
-        ratio = measures.ratio_with_interval(finals(instance, "tree"), finals(instance, expert))
+        ratio = measures.ratio_with_interval(*measures.side_by_side(finals(instance, "tree"), finals(instance, expert)))
         result.append({"instance": instance["instance"], "expert": expert, **ratio})
     return result
 
@@ -93,8 +93,8 @@ def up_to_speed(instance: Mapping[str, Any], times: Sequence[float], method: str
 
 
 def mean_curve(scene: Mapping[str, Any], method: str) -> np.ndarray | None:
-    """Rate over time, mean over instances; None where the method was not run on all."""
-    curves = [i["methods"][method]["curve"] for i in scene["instances"] if method in i["methods"]]
+    """Rate over time, mean over instances and the seeds that ran beside the experts; None where it was not run on all."""
+    curves = [i["methods"][method]["curve_beside"] for i in scene["instances"] if method in i["methods"]]
     return np.mean(curves, axis=0) if len(curves) == len(scene["instances"]) else None
 
 

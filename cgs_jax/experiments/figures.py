@@ -44,7 +44,8 @@ def colours_of(scene: Mapping[str, Any]) -> dict[str, str]:
 
 
 def rates(scene: Mapping[str, Any], path: Path) -> None:
-    """Rate over time: mean over instances with the spread between them, and each instance over tree's final rate."""
+    """Rate over time: mean over instances with the spread between them, and each instance over tree's final rate. Of the seeds
+    that ran beside the experts."""
     times = np.array(scene["times"])
     colours = colours_of(scene)
     with plt.rc_context(STYLE):
@@ -55,12 +56,13 @@ def rates(scene: Mapping[str, Any], path: Path) -> None:
             curve = mean_curve(scene, method)
             if curve is None:
                 continue
-            each = np.array([instance["methods"][method]["curve"] for instance in scene["instances"]])
+            each = np.array([instance["methods"][method]["curve_beside"] for instance in scene["instances"]])
             low, high = np.quantile(each, [0.25, 0.75], axis=0)
             width = 2.2 if method.startswith("tree") else 1.4
             absolute.plot(times, curve, color=colour, lw=width, label=method)
             absolute.fill_between(times, low, high, color=colour, alpha=0.10, lw=0)
-            trees = np.array([np.mean(finals(instance, "tree")) for instance in scene["instances"]])
+            beside = scene["budget"]["expert_seeds"]
+            trees = np.array([np.mean(finals(instance, "tree")[:beside]) for instance in scene["instances"]])
             if (trees > 0).any():
                 shares = each[trees > 0] / trees[trees > 0, None]
                 low, high = np.quantile(shares, [0.25, 0.75], axis=0)

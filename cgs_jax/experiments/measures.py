@@ -57,6 +57,13 @@ def time_of_overtaking(ours: Floats, theirs: Floats, times: Floats) -> float | N
     return float(times[below[-1] + 1]) if below[-1] + 1 < len(times) else None
 
 
+def side_by_side(ours: Sequence[float], theirs: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
+    """Of two methods' numbers by seed, those of the seeds that both have: these ran one after the other. Where one has more, a
+    change of the machine's speed would meet it alone."""
+    both = min(len(ours), len(theirs))
+    return ours[:both], theirs[:both]
+
+
 def ratio_with_interval(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, float | None]:
     """Mean over mean with a bootstrap interval over seeds; all None where theirs is 0 (nothing to compare with)."""
     above, below = np.asarray(ours, float), np.asarray(theirs, float)
@@ -130,13 +137,14 @@ def coverage_of_instance(
 
 
 def relative_to_tree(instances: Sequence[Mapping[str, Any]], variable: str, method: str, what: str) -> list[float]:
-    """A coverage number of a method over tree's mean on the same instance, for every instance and seed."""
+    """A coverage number of a method over tree's mean on the same instance, for every instance and seed (`side_by_side`)."""
     ratios = []
     for instance in instances:
         methods = instance["variables"][variable]["methods"]
         ours, trees = methods.get(method, {}).get(what), methods["tree"].get(what)
-        if ours and trees and np.mean(trees) > 0:
-            ratios += [value / float(np.mean(trees)) for value in ours]
+        if ours and trees:
+            ours, trees = side_by_side(ours, trees)
+            ratios += [value / float(np.mean(trees)) for value in ours if np.mean(trees) > 0]
     return ratios
 
 

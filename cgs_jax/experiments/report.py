@@ -45,7 +45,8 @@ def text(numbers: Mapping[str, Any], confronted: Sequence[claims.Claim], command
         "# The paper's experiments on this implementation",
         f"Made by `{command}` on {_machine()}. Rates are samples per second of sampling time with all programs "
         "compiled and read; what that takes is listed apart. *Final rate*: over the last half of a run. Every sample counted "
-        "passed the audit in double precision. Brackets are 95 % bootstrap intervals over seeds. "
+        "passed the audit in double precision. Brackets are 95 % bootstrap intervals over seeds. Methods are compared over "
+        "the seeds that both have, whose runs were made one after the other: the machine's speed changes. "
         "The paper's numbers were measured on an Intel i5-4200U at 1.6 GHz; ratios between machines say little.",
         "## Claims",
         _claims(confronted),

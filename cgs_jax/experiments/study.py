@@ -411,6 +411,7 @@ class Study:
         for entry in methods.values():
             rates = np.array(entry.pop("rates"))
             entry["curve"] = np.round(rates.mean(axis=0), 2).tolist()
+            entry["curve_beside"] = np.round(rates[: self.budget.expert_seeds].mean(axis=0), 2).tolist()
         reference: dict[str, list] = {}
         for run in self.reference_runs(scene):
             if run.instance == instance:
