@@ -99,7 +99,10 @@ CURIOSITY = 0.025
 """First trials of operators may take this share of the time."""
 
 KEEN_CURIOSITY = 0.15
-"""Those of operators that may make the best sequence may take so much, unless the start was warm."""
+"""Those of operators that may make the best sequence may take so much after `KEEN_AFTER`, unless the start was warm."""
+
+KEEN_AFTER = 4.0
+"""Seconds that workers spend on batches before that: the first samples come first."""
 
 SURPRISE = 0.5
 """Guess by how much, in logarithms, operators do better than guessed (`_surprise`)."""
@@ -1081,13 +1084,16 @@ class Tree(_Records):
     @property
     def _curious(self) -> bool:
         """Is it time to ask for a first trial?"""
-        return self._states is not None and not self._choices % CURIOUS_EVERY and self._may_try(KEEN_CURIOSITY)
+        return self._states is not None and not self._choices % CURIOUS_EVERY and self._may_try(keen=True)
 
-    def _may_try(self, share: float) -> bool:
-        """Did first trials take less than that share of the time?"""
+    def _may_try(self, keen: bool = False) -> bool:
+        """Did first trials take less than their share of the time? keen: of what may make the best sequence."""
         if self._earlier_batches:
             return self._total.first_trials + TRIAL_SECONDS <= CURIOSITY * self._total.spent
-        return self._total.first_trials <= share * self._total.spent
+        share = CURIOSITY * self._total.spent
+        if keen:
+            share = max(share, KEEN_CURIOSITY * (self._total.spent - KEEN_AFTER))
+        return self._total.first_trials <= share
 
     def _path_to_untried(self) -> Path:
         """A sequence with the operator that never ran and promises most; () where all have run or it is too early.
@@ -1098,7 +1104,7 @@ class Tree(_Records):
         if self._untried_at != self._epoch:
             self._untried_at, self._untried = self._epoch, self._most_promising_untried()
         promise, path = self._untried
-        return path if promise > 0.0 or self._may_try(CURIOSITY) else ()
+        return path if promise > 0.0 or self._may_try() else ()
 
     def _most_promising_untried(self) -> tuple[float, Path]:
         """1 - price * seconds per sample of that sequence, below 0 where it is worse than the best one; and the sequence."""

@@ -14,6 +14,7 @@ from cgs_jax.uct import (
     CURIOSITY,
     CURIOUS_EVERY,
     DISAPPOINTED,
+    KEEN_AFTER,
     KEEN_CURIOSITY,
     PROMISE,
     Fixed,
@@ -560,18 +561,18 @@ def test_of_the_operators_that_never_ran_the_one_that_may_make_the_best_sequence
     tree.record((), other[0], 1000, 15, 0.1)
     tree._refresh()
     settle_on(tree, usual, advantage=0.0)
-    tree._total.spent, tree._choices = 1.0, CURIOUS_EVERY - 1
-    tree._total.first_trials = 0.5 * (CURIOSITY + KEEN_CURIOSITY)
+    tree._total.spent, tree._choices = 2.0 * KEEN_AFTER, CURIOUS_EVERY - 1
+    tree._total.first_trials = 0.9 * KEEN_CURIOSITY * KEEN_AFTER
     assert tree.select() == joint
     tree.record((), joint[0], 1000, 0, 0.1)
     tree._refresh()
     settle_on(tree, usual, advantage=0.0)
     # What promises less than the best sequence has to wait for its share of the time.
     tree._total.explored = 1e9
-    tree._total.spent, tree._choices = 1.0, CURIOUS_EVERY - 1
-    tree._total.first_trials = 0.5 * (CURIOSITY + KEEN_CURIOSITY)
+    tree._total.spent, tree._choices = 2.0 * KEEN_AFTER, CURIOUS_EVERY - 1
+    tree._total.first_trials = 0.9 * KEEN_CURIOSITY * KEEN_AFTER
     assert tree.select() == usual
-    tree._total.first_trials, tree._choices = 0.5 * CURIOSITY, CURIOUS_EVERY - 1
+    tree._total.first_trials, tree._choices = 0.5 * CURIOSITY * tree._total.spent, CURIOUS_EVERY - 1
     assert tree.select()[0].new == ("q2", "t")
 
 
