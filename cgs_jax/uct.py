@@ -1090,10 +1090,10 @@ class Tree(_Records):
         """Did first trials take less than their share of the time? keen: of what may make the best sequence."""
         if self._earlier_batches:
             return self._total.first_trials + TRIAL_SECONDS <= CURIOSITY * self._total.spent
-        share = CURIOSITY * self._total.spent
+        allowed = CURIOSITY * self._total.spent
         if keen:
-            share = max(share, KEEN_CURIOSITY * (self._total.spent - KEEN_AFTER))
-        return self._total.first_trials <= share
+            allowed = max(allowed, KEEN_CURIOSITY * (self._total.spent - KEEN_AFTER))
+        return self._total.first_trials <= allowed
 
     def _path_to_untried(self) -> Path:
         """A sequence with the operator that never ran and promises most; () where all have run or it is too early.
