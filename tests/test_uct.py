@@ -791,7 +791,7 @@ class HistoryWorld:
 
 
 def test_choice_converges_where_histories_matter():
-    """3,000 batches, about as many as a run of 30 s has. Over these worlds 0.4 to 1.0 of the best of 960 sequences' rate:
+    """3,000 batches, about as many as a run of 30 s has. Over these worlds 0.92 to 1.0 of the best of 960 sequences' rate:
     operators succeed far more often here than their rows and dof let expect, and some are tried late."""
     transitions, reached = Transitions(handover()), []
     for seed in range(5):
@@ -800,4 +800,4 @@ def test_choice_converges_where_histories_matter():
             world.run(tree)
         least = min(map(world.seconds_per_sample, transitions.sequences()))
         reached.append(least * tree.rate)
-    assert min(reached) > 0.35 and np.mean(reached) > 0.7
+    assert min(reached) > 0.6 and np.mean(reached) > 0.85
