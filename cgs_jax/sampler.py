@@ -221,8 +221,9 @@ NICENESS = 10
 AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
-AUDIT_BATCHES = 32
-"""Batches after which full samples are audited, however few there are."""
+AUDIT_BATCHES = 16
+"""Batches after which full samples are audited, however few there are. In the beginning as soon as as many wait as were found:
+whoever watches, or stops at a number of samples, should not wait for the first ones."""
 
 TRIES = 0
 """Name under which the number of earlier tries travels with a waiting condition (no variable can be called that)."""
@@ -904,8 +905,8 @@ class Sampler:
         if not self._candidates:
             return False
         waiting = sum(candidates.size for candidates in self._candidates)
-        many = AUDIT_SAMPLES if wanted is None else min(AUDIT_SAMPLES, wanted - found)
-        return not found or waiting >= many or self._batches_waited >= AUDIT_BATCHES
+        many = min(AUDIT_SAMPLES, found) if wanted is None else min(AUDIT_SAMPLES, found, wanted - found)
+        return waiting >= many or self._batches_waited >= AUDIT_BATCHES
 
     def _take_candidates(self) -> list[_Candidates]:
         taken, self._candidates, self._batches_waited = self._candidates, [], 0

@@ -51,6 +51,17 @@ def test_events_come_in_order_and_end_with_the_number_asked_for(fixed):
         assert event.qpos.shape[1:] == (2, problem("pick_place").scene.model.nq)
 
 
+def test_samples_are_handed_over_when_as_many_wait_as_were_found():
+    waiting = found = handed_over = 0
+    for event in sampler().events(60.0, 2000):
+        if isinstance(event, Ran):
+            assert waiting == 0 or waiting < found
+            waiting += event.cleared * (event.position == len(event.path) - 1)
+        elif isinstance(event, Found):
+            found, waiting, handed_over = found + len(event.qpos), 0, handed_over + 1
+    assert found == 2000 and handed_over > 4
+
+
 def test_a_fixed_sequence_runs_full_batches_from_the_first_one_on(fixed):
     assert of(Ran, fixed)[0].tasks == SETTINGS.batch_size
 
