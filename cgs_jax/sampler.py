@@ -16,7 +16,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -212,6 +212,9 @@ LEAST_UNKNOWNS = 7
 REPRESENTATIVE = 128
 """Tasks from which on a batch tells how fast its program is: the time of smaller ones is mostly fixed."""
 
+REMEMBERED = 12
+"""Batches of a program that its pace is taken from."""
+
 BEFORE_COMPILER = 10.0
 """Seconds of sampling for which workers and compiler share the cores as equals: samples are wanted soon, most of all."""
 
@@ -256,14 +259,16 @@ class _Pace:
 
     The measured time of a small batch says little of what the operator would cost if it were chosen: lanes stand empty, and
     on a busy machine one wait weighs more than the work. So what is charged is what the work would cost in a full batch. A
-    program that only ran small batches is judged by what others cost, in proportion to its squared number of unknowns.
+    program that only ran small batches is judged by what others cost, in proportion to its squared number of unknowns. Of the
+    last batches the quicker ones are believed: a program's first ones, or those that others disturbed, take several times as
+    long, and would make the sequence that a run starts with look worse than those that it has not run.
     """
 
     def __init__(self, lanes: int, batch_size: int) -> None:
         self._lanes, self._batch_size = lanes, batch_size
-        # Seconds and units of work (tasks and iterations times squared unknowns), discounted, large batches first.
-        self._programs: dict[Any, tuple[float, float]] = {}
-        self._all = 0.0, 0.0
+        # Seconds per unit of work (tasks and iterations times squared unknowns) of the last larger batches.
+        self._programs: defaultdict[Any, deque[float]] = defaultdict(lambda: deque(maxlen=REMEMBERED))
+        self._all: deque[float] = deque(maxlen=4 * REMEMBERED)
         self._steps: dict[int, float] = {}  # by operator: one and the iterations of a task
 
     def seconds(self, operator: Operator, tasks: int, iterations: int, measured: float, look: bool) -> float:
@@ -271,11 +276,10 @@ class _Pace:
 
         Looks may run in the scheduling process, beside workers that start.
         """
-        program = operator.plan.layout
         if tasks >= REPRESENTATIVE and not look:
-            work = (tasks + iterations + DRAIN * self._lanes) * _squared_unknowns(operator)
-            self._programs[program] = _mixed(self._programs.get(program, (0.0, 0.0)), measured, work, tasks)
-            self._all = _mixed(self._all, measured, work, tasks)
+            unit = measured / ((tasks + iterations + DRAIN * self._lanes) * _squared_unknowns(operator))
+            self._programs[operator.plan.layout].append(unit)
+            self._all.append(unit)
         steps = 1.0 + iterations / tasks
         self._steps[operator.identity] = 0.7 * self._steps.get(operator.identity, steps) + 0.3 * steps
         return tasks * self._per_task(operator, steps)[0]
@@ -287,16 +291,11 @@ class _Pace:
 
     def _per_task(self, operator: Operator, steps: float) -> tuple[float, int]:
         """Device seconds per task of a full batch, and how many tasks that has."""
-        seconds, work = self._programs.get(operator.plan.layout, self._all)
-        unit = _squared_unknowns(operator) * (seconds / work if work else FIRST_GUESS)
+        units = sorted(self._programs[operator.plan.layout] or self._all)
+        unit = _squared_unknowns(operator) * (units[len(units) // 4] if units else FIRST_GUESS)
         # Fewer tasks than lanes take as long, and would make the operator look slower still.
         full = int(min(self._batch_size, max(BATCH_SECONDS / (unit * steps), self._lanes)))
         return unit * (steps + DRAIN * self._lanes / full), full
-
-
-def _mixed(known: tuple[float, float], seconds: float, work: float, tasks: int) -> tuple[float, float]:
-    """Old evidence discounted, and a batch with the weight of its number of tasks."""
-    return 0.9 * known[0] + tasks * seconds, 0.9 * known[1] + tasks * work
 
 
 def _squared_unknowns(operator: Operator) -> int:

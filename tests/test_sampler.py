@@ -9,7 +9,7 @@ from loaded import problem
 from cgs_jax.api import make_chooser
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
-from cgs_jax.sampler import Finished, Found, Pool, Ran, Sampler, SamplerSettings, Started
+from cgs_jax.sampler import Finished, Found, Pool, Ran, Sampler, SamplerSettings, Started, _Pace
 
 SETTINGS = SamplerSettings(batch_size=128, lanes=32, workers=1, deterministic=True)
 
@@ -60,6 +60,17 @@ def test_samples_are_handed_over_when_as_many_wait_as_were_found():
         elif isinstance(event, Found):
             found, waiting, handed_over = found + len(event.qpos), 0, handed_over + 1
     assert found == 2000 and handed_over > 4
+
+
+def test_what_is_charged_is_what_the_quicker_batches_took():
+    """2,048 tasks of seven iterations in 0.5 s at first, in 0.02 s once the machine has settled."""
+    at = problem("pick_place")
+    operator = operator_of(at, at.transitions.parse("t; q1; q2")[1])
+    pace, tasks = _Pace(128, 2048), 2048
+    charged = [pace.seconds(operator, tasks, 7 * tasks, measured, look=False) for measured in (0.5, 0.5, 0.02, 0.02)]
+    assert min(charged[:2]) >= 0.5
+    assert charged[2:] == pytest.approx([0.02, 0.02])
+    assert pace.seconds(operator, tasks, 7 * tasks, 0.5, look=False) == pytest.approx(0.02)
 
 
 def test_a_fixed_sequence_runs_full_batches_from_the_first_one_on(fixed):
