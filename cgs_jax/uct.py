@@ -102,7 +102,7 @@ KEEN_CURIOSITY = 0.15
 """Those of operators that may make the best sequence may take so much after `KEEN_AFTER`, unless the start was warm."""
 
 KEEN_AFTER = 4.0
-"""Seconds that workers spend on batches before that: the first samples come first."""
+"""Seconds that workers spend on batches before that, and before a warm start explores: the first samples come first."""
 
 SURPRISE = 0.5
 """Guess by how much, in logarithms, operators do better than guessed (`_surprise`)."""
@@ -1058,6 +1058,8 @@ class Tree(_Records):
     @property
     def _allowed_to_explore(self) -> float:
         """Batches that may have gone by now into other sequences than the incumbent."""
+        if self._proven and self._total.spent < KEEN_AFTER:
+            return 0.0
         # After a warm start as little from the beginning as at the end of the earlier runs.
         return EXPLORATION * math.log1p(self._total.batches / (self._earlier_batches + EXPLORATION))
 

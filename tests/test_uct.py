@@ -447,6 +447,30 @@ def test_a_warm_start_runs_the_best_sequence_of_earlier_instances_until_it_fails
     Tree(transitions).warm_start([old], n_equiv=5)
 
 
+def test_a_warm_start_explores_after_the_first_samples():
+    """a then b: 25 samples/s, the others hardly less. Nothing else runs in the first four seconds of the workers."""
+    transitions = pair_graph()
+    best, *others = (transitions.parse(text) for text in ("a; b", "b; a", "(a,b)"))
+    firsts = {best: 50, others[0]: 48, others[1]: 24}
+
+    def roll(tree, path):
+        for i, transition in enumerate(path):
+            tried = firsts[path] if i else 100
+            tree.record(path[:i], transition, tried, firsts[path], 1.0, spent=0.02)
+
+    earlier = Tree(transitions)
+    for _ in range(200):
+        for path in firsts:
+            roll(earlier, path)
+    warm = Tree(transitions)
+    warm.warm_start([earlier.as_json()], n_equiv=5)
+    chosen = []
+    for _ in range(1000):
+        chosen.append(warm.select())
+        roll(warm, chosen[-1])
+    assert set(chosen[:100]) == {best} and set(chosen[100:]) > {best}
+
+
 def test_a_warm_start_begins_with_what_did_well_on_most_instances():
     """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average."""
     transitions = pair_graph()
