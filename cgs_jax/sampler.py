@@ -153,7 +153,9 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Job:
+class Job:
+    """A batch to run, the last step of a partial sequence."""
+
     path: Path
     position: int
     step: _Step
@@ -164,7 +166,7 @@ class _Job:
 
 
 @dataclass(frozen=True)
-class _Candidates:
+class Candidates:
     """Full samples of one batch, to be audited."""
 
     path: Path
@@ -277,7 +279,7 @@ class _Pace:
         Looks may run in the scheduling process, beside workers that start.
         """
         if tasks >= REPRESENTATIVE and not look:
-            unit = measured / ((tasks + iterations + DRAIN * self._lanes) * _squared_unknowns(operator))
+            unit = measured / ((tasks + iterations + DRAIN * self._lanes) * squared_unknowns(operator))
             self._programs[operator.plan.layout].append(unit)
             self._all.append(unit)
         steps = 1.0 + iterations / tasks
@@ -292,13 +294,14 @@ class _Pace:
     def _per_task(self, operator: Operator, steps: float) -> tuple[float, int]:
         """Device seconds per task of a full batch, and how many tasks that has."""
         units = sorted(self._programs[operator.plan.layout] or self._all)
-        unit = _squared_unknowns(operator) * (units[len(units) // 4] if units else FIRST_GUESS)
+        unit = squared_unknowns(operator) * (units[len(units) // 4] if units else FIRST_GUESS)
         # Fewer tasks than lanes take as long, and would make the operator look slower still.
         full = int(min(self._batch_size, max(BATCH_SECONDS / (unit * steps), self._lanes)))
         return unit * (steps + DRAIN * self._lanes / full), full
 
 
-def _squared_unknowns(operator: Operator) -> int:
+def squared_unknowns(operator: Operator) -> int:
+    """What the work of an iteration grows with."""
     return max(operator.plan.layout.unknowns, LEAST_UNKNOWNS) ** 2
 
 
@@ -485,7 +488,7 @@ class Sampler:
         self._tasks: dict[int, int] = {}
         self._steps: dict[Path, tuple[_Step, ...]] = {}
         self._visits: dict[History, int] = {}
-        self._candidates: list[_Candidates] = []
+        self._candidates: list[Candidates] = []
         self._batches_waited = 0  # by the first of them
         self._refused: defaultdict[History, int] = defaultdict(int)  # by the audit, and not yet taken off the successes
         self._pace = _Pace(s.lanes, s.batch_size)
@@ -589,7 +592,7 @@ class Sampler:
         found = 0
         reason = "time"
         threads = ThreadPoolExecutor(self.settings.workers + 1, thread_name_prefix="sample")
-        in_flight: list[tuple[_Job | list[_Candidates], Future[Any]]] = []
+        in_flight: list[tuple[Job | list[Candidates], Future[Any]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
         try:
             while True:
@@ -607,12 +610,12 @@ class Sampler:
                 most = self.settings.workers if self.settings.deterministic else crew.size + 2
                 self._stand_back(crew, elapsed)
                 while len(in_flight) < most:
-                    work: _Job | list[_Candidates] | None
+                    work: Job | list[Candidates] | None
                     if self._audit_due(found, num_samples):
-                        work = self._take_candidates()
+                        work = self.take_candidates()
                         future: Future[Any] = threads.submit(crew.audit, _together(work))
                     else:
-                        work = self._next_job()
+                        work = self.next_job()
                         if work is None:
                             break
                         future = threads.submit(crew.run, work.batch, work.look)
@@ -630,8 +633,8 @@ class Sampler:
                 if not self.settings.deterministic:
                     at = next(i for i, (_, future) in enumerate(in_flight) if future.done())
                 work, future = in_flight.pop(at)
-                if isinstance(work, _Job):
-                    yield self._absorb(work, future.result())
+                if isinstance(work, Job):
+                    yield self.absorb(work, future.result())
                     continue
                 for event in self._found(work, future.result(), clock() - start):
                     if num_samples is not None and found + len(event.qpos) > num_samples:
@@ -640,10 +643,10 @@ class Sampler:
                     yield event
             # What was finished in time is not thrown away.
             for work, future in in_flight:
-                if not isinstance(work, _Job) and reason != "samples":
+                if not isinstance(work, Job) and reason != "samples":
                     yield from self._found(work, future.result(), clock() - start)
             if self._candidates and reason != "samples":
-                rest = self._take_candidates()
+                rest = self.take_candidates()
                 yield from self._found(rest, self._runner.audit(_together(rest)), clock() - start)
         finally:
             threads.shutdown(wait=True, cancel_futures=True)
@@ -742,7 +745,8 @@ class Sampler:
         """The sequence that is run whatever comes out of it: the incumbent of a tree, a fixed one; () without one."""
         return getattr(self.chooser, "incumbent", getattr(self.chooser, "path", ()))
 
-    def _next_job(self) -> _Job | None:
+    def next_job(self) -> Job | None:
+        """What to run next; None while nothing is ready."""
         path = self._choose()
         if not path:
             return None
@@ -753,7 +757,7 @@ class Sampler:
             job = self._job_of(known) if known else None
         return job or self._job_of(path, again=True)
 
-    def _job_of(self, path: Path, again: bool = False) -> _Job | None:
+    def _job_of(self, path: Path, again: bool = False) -> Job | None:
         """The batch that the sequence needs most; None where that is being looked at for the first time, unless `again`."""
         steps = self._steps_of(path)
         makers = {step.makes: position for position, step in enumerate(steps)}
@@ -804,7 +808,7 @@ class Sampler:
     def _pool(self, history: History) -> Pool:
         return self._pools.setdefault(history, Pool())
 
-    def _job(self, path: Path, position: int, step: _Step, waiting: Pool, most: int, look: bool) -> _Job:
+    def _job(self, path: Path, position: int, step: _Step, waiting: Pool, most: int, look: bool) -> Job:
         if not step.reads:
             conditions: Values = {}
             count, tries = most, np.zeros(most, np.int32)
@@ -824,11 +828,12 @@ class Sampler:
             count = len(tries)
         first = self._tasks.get(step.operator.identity, 0)
         self._tasks[step.operator.identity] = first + count
-        return _Job(path, position, step, Batch(step.transition, conditions, count, first), tries, look)
+        return Job(path, position, step, Batch(step.transition, conditions, count, first), tries, look)
 
     # -------------------------------------------------------------- results
 
-    def _absorb(self, job: _Job, outcome: Outcome) -> Ran:
+    def absorb(self, job: Job, outcome: Outcome) -> Ran:
+        """Takes in what came of a job: statistics, pools, full samples."""
         success = outcome.success
         self._looked_at.discard(job.step.makes)
         given_up = ~success
@@ -879,7 +884,7 @@ class Sampler:
             host_seconds=outcome.host_seconds,
         )
 
-    def _keep(self, job: _Job, values: Values) -> None:
+    def _keep(self, job: Job, values: Values) -> None:
         """Puts what a batch made into the pool of its component; full samples wait for the audit."""
         step = job.step
         if step.transition.target != self._full:
@@ -895,7 +900,7 @@ class Sampler:
             values = {}
             for pool in pools:
                 values |= pool.take(count)
-        self._candidates.append(_Candidates(job.path, step.makes, values))
+        self._candidates.append(Candidates(job.path, step.makes, values))
 
     # -------------------------------------------------------------- the audit
 
@@ -907,11 +912,12 @@ class Sampler:
         many = min(AUDIT_SAMPLES, found) if wanted is None else min(AUDIT_SAMPLES, found, wanted - found)
         return waiting >= many or self._batches_waited >= AUDIT_BATCHES
 
-    def _take_candidates(self) -> list[_Candidates]:
+    def take_candidates(self) -> list[Candidates]:
+        """The full samples that wait for the audit, which are no longer kept."""
         taken, self._candidates, self._batches_waited = self._candidates, [], 0
         return taken
 
-    def _found(self, candidates: list[_Candidates], audited: Audited, elapsed: float) -> Iterator[Found]:
+    def _found(self, candidates: list[Candidates], audited: Audited, elapsed: float) -> Iterator[Found]:
         """What passed, one event for each sequence, with its share of the time."""
         values = _together(candidates)
         made_by = np.repeat(np.arange(len(candidates)), [part.size for part in candidates])
@@ -933,7 +939,7 @@ class Sampler:
             )
 
 
-def _together(candidates: list[_Candidates]) -> Values:
+def _together(candidates: list[Candidates]) -> Values:
     names = candidates[0].values
     return {name: np.concatenate([part.values[name] for part in candidates]) for name in names}
 

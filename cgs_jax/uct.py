@@ -842,7 +842,7 @@ class _Records:
 
     def _history_at(self, text: str) -> _History:
         """The history that a partial sequence makes."""
-        prefix = _read_prefix(self.transitions, text)
+        prefix = read_prefix(self.transitions, text)
         edge = self._follow(prefix)[-1]
         self._name(edge, prefix)
         return edge.history
@@ -1618,7 +1618,7 @@ def _read_statistics(entry: dict[str, Any]) -> Statistics:
     return Statistics(float(entry["visits"]), attempts, successes, float(entry["seconds"]))
 
 
-def _read_prefix(transitions: Transitions, text: str) -> Path:
+def read_prefix(transitions: Transitions, text: str) -> Path:
     """The transitions of a partial sequence."""
     path: list[Transition] = []
     state: State = frozenset()

@@ -3,11 +3,13 @@
     python scripts/benchmark.py                                   all but `options`, `variants` and the peer; about 25 minutes
     python scripts/benchmark.py throughput --scenes handover --instances 0-3 --window 4,8
     python scripts/benchmark.py --peer komo [--python PATH]       both programs in turn on the peer's scenes
+    python scripts/benchmark.py search --study runs/reproduce --seconds 10    how near the tree comes to the best sequence
     python scripts/benchmark.py throughput --against old.json     measure, then compare: exit status 1 if slower
     python scripts/benchmark.py --results new.json --against old.json        compare only
 
-Parts: throughput, operators, start, scaling, utilisation, options, variants. Prints tables and writes one JSON file with the
-machine, versions, date and the load average before and after each part. `docs/performance.md` says what each number means.
+Parts: throughput, operators, start, scaling, utilisation, options, variants, search. Prints tables and writes one JSON file
+with the machine, versions, date and the load average before and after each part. `docs/performance.md` says what each number
+means.
 
 Exit status: 0; 1 when a ratio to `--against` is below the threshold; 2 for bad input.
 """
@@ -689,6 +691,71 @@ def options_tables(report: Mapping[str, Any]) -> list[Table]:
     return tables
 
 
+# ------------------------------------------------------------------ search
+
+
+def search(given: argparse.Namespace) -> dict[str, Any]:
+    """How near a method comes to the best sequence in simulated runs, in every instance that a study has run.
+
+    Each round draws another world; its best sequence is known and is simulated too, so that both have the same overheads.
+    """
+    from cgs_jax import load_problem
+    from cgs_jax.api import make_chooser
+    from cgs_jax.experiments.measures import final_rate
+    from cgs_jax.experiments.runs import Store
+    from cgs_jax.experiments.simulation import World, simulate
+    from cgs_jax.uct import Fixed
+
+    if given.study is None:
+        raise InputError("search reads what the runs of a study learned, expected --study DIR")
+    store, seconds = Store(given.study / "runs"), given.seconds
+    report: dict[str, Any] = {"seconds": seconds, "rounds": given.rounds, "method": given.method, "scenes": {}}
+    for scene in given.scenes:
+        rows = {}
+        for instance in given.instances:
+            trees = store.trees(scene, instance)
+            if not trees:
+                continue
+            problem = load_problem(scene, instance)
+            shares = []
+            for seed in range(given.seed, given.seed + given.rounds):
+                world = World(problem, trees, seed)
+                best = simulate(world, Fixed(problem.transitions, world.best), seed, seconds)
+                chooser = make_chooser(problem, given.method, seed)
+                found = simulate(world, chooser, seed, seconds)
+                ended = chooser.best_sequences(1)
+                early = 0.2 * seconds
+                shares.append(
+                    {
+                        "early": (found <= early).sum() / early / final_rate(best, seconds),
+                        "final": final_rate(found, seconds) / final_rate(best, seconds),
+                        "end": world.rate(ended[0][0]) / world.best_rate if ended else 0.0,
+                        "best": problem.transitions.format(world.best),
+                    }
+                )
+            rows[str(instance)] = {name: [share[name] for share in shares] for name in ("early", "final", "end", "best")}
+        if rows:
+            report["scenes"][scene] = rows
+    if not report["scenes"]:
+        raise InputError(f"no runs of tree on {', '.join(given.scenes)} in {given.study}, expected the folder of a study")
+    return report
+
+
+def search_tables(report: Mapping[str, Any]) -> list[Table]:
+    """One table: shares of the best sequence's rate, means over rounds."""
+    seconds = report["seconds"]
+    title = f"Simulated runs of {report['method']}, share of the best sequence's rate, means of {report['rounds']}"
+    columns = ["instance", f"first {0.2 * seconds:g} s", f"{0.5 * seconds:g} to {seconds:g} s", "best found"]
+    table = new_table(title, columns)
+    names = ("early", "final", "end")
+    for scene, rows in report["scenes"].items():
+        means = {instance: [statistics.mean(row[name]) for name in names] for instance, row in rows.items()}
+        for instance, values in means.items():
+            table.add_row(f"{scene} {instance}", *(f"{value:.2f}" for value in values))
+        table.add_row(f"{scene}, mean", *(f"{statistics.mean(column):.3f}" for column in zip(*means.values(), strict=True)))
+    return [table]
+
+
 # ------------------------------------------------------------------ the peer
 
 
@@ -914,6 +981,7 @@ PARTS: dict[str, tuple[Callable[[argparse.Namespace], dict[str, Any]], Callable[
     "utilisation": (utilisation, utilisation_tables),
     "options": (options, options_tables),
     "variants": (variants, variants_tables),
+    "search": (search, search_tables),
     "komo": (komo, komo_tables),
 }
 
@@ -1007,18 +1075,19 @@ def parse() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", type=names_in, default=list(TARGETS), help="default: pick_place,handover,banana")
     parser.add_argument("--peer-scenes", type=names_in, default=list(PEER_RATIOS), help="default: pp,ho,ho2")
     parser.add_argument(
-        "--instances", type=numbers_in, default=list(range(8)), help="of throughput; others take the first (default 0-7)"
+        "--instances", type=numbers_in, default=list(range(8)), help="of throughput, search; else the first (default 0-7)"
     )
     parser.add_argument(
         "--window", type=window_in, default=(10.0, 20.0), metavar="A,B", help="seconds of sampling that count (default 10,20)"
     )
     parser.add_argument(
-        "--seconds", type=float, default=6.0, help="of one measurement in scaling, options, variants, the peer (default 6)"
+        "--seconds", type=float, default=6.0, help="of one run in scaling, options, variants, search, the peer (default 6)"
     )
     parser.add_argument(
-        "--rounds", type=int, default=3, help="warm starts, seeds of options and variants, turns with the peer (default 3)"
+        "--rounds", type=int, default=3, help="warm starts, turns with the peer, seeds of the others (default 3)"
     )
-    parser.add_argument("--method", default="tree", help="method of throughput, operators, utilisation, peer (default tree)")
+    parser.add_argument("--method", default="tree", help="of throughput, operators, utilisation, search, peer (default tree)")
+    parser.add_argument("--study", type=Path, metavar="DIR", help="folder of scripts/reproduce.py, for search")
     sizes = [256, 512, 1024, 2048, 4096]
     parser.add_argument("--batches", type=numbers_in, default=sizes, help="batch sizes of scaling, options")
     parser.add_argument("--lanes", type=numbers_in, default=[16, 32, 64, 128, 256], help="lanes of scaling")

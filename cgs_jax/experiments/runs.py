@@ -77,6 +77,12 @@ class Store:
                 {name[2:]: arrays[name] for name in names},
             )
 
+    def trees(self, scene: str, instance: int) -> list[Mapping[str, Any]]:
+        """What the runs on an instance learned that began with nothing, in the order of the files' names."""
+        kinds = f"main/i{instance}_tree_s*.json", f"survey/i{instance}_survey_s*.json"
+        files = sorted(file for kind in kinds for file in (self.folder / scene).glob(kind))
+        return [json.loads(file.read_text(encoding="utf-8"))["tree"] for file in files]
+
     def _file(self, run: Run, suffix: str) -> File:
         return self.folder / f"{run.key}.{suffix}"
 
