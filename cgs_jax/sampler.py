@@ -724,8 +724,9 @@ class Sampler:
 
         What that is worth may depend on how its inputs came about as much as tenfold, and nothing else would show it.
         """
-        if self._patience > 0:
+        if self._patience > 0 and not self._hopeless(self._pursued):
             return self._pursued
+        self._patience = 0
         if not self._ended and self._pursued and self._chosen_for < FIRST_PURSUIT:
             self._chosen_for += 1
             return self._pursued
@@ -744,6 +745,11 @@ class Sampler:
     def _known(self) -> Path:
         """The sequence that is run whatever comes out of it: the incumbent of a tree, a fixed one; () without one."""
         return getattr(self.chooser, "incumbent", getattr(self.chooser, "path", ()))
+
+    def _hopeless(self, path: Path) -> bool:
+        """Whether the chooser, if it is a tree, has given up a sequence."""
+        asked = getattr(self.chooser, "hopeless", None)
+        return asked is not None and asked(path)
 
     def next_job(self) -> Job | None:
         """What to run next; None while nothing is ready."""

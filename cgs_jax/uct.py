@@ -77,7 +77,13 @@ VISIT_TRIES = 32
 """Smaller batches count as visits in proportion."""
 
 NEXT_TRY = 30.0
-"""Weight, in tries, of the belief that a further try succeeds as often as the one before."""
+"""Weight, in tries, of the belief that an operator's further try falls off as those of the others do."""
+
+FALLING_OFF = 0.8
+"""Guess of the success of a further try over that of the one before (`_falling_off`)."""
+
+FALLING_OFF_TRIES = 300.0
+"""Weight of that guess, and the greatest one of what an operator says of it, in tries."""
 
 RETRIES = 300.0
 """Weight, in tries, of what earlier instances say of each further try, as far as they made so many."""
@@ -154,6 +160,10 @@ BELIEVED_TRIES = 8.0
 BELIEVED_LABELS = 3
 """Partial sequences that are kept in every state in the search for that one: the best one need not begin with the cheapest."""
 
+HOPELESS = 0.3
+"""A sequence that would make less than this share of the incumbent's rate, if its first looks are believed, is not looked at
+further: often one step succeeds once in fifty times."""
+
 SETTLED = 4.0
 """What was tried so many times as often as the average weighs is known: its own evidence is believed anyway."""
 
@@ -197,10 +207,11 @@ class Statistics:
         """Attempts, whichever try they were."""
         return sum(self.attempts)
 
-    def hazards(self, prior: Sequence[float], weight: float) -> list[float]:
+    def hazards(self, prior: Sequence[float], weight: float, falling_off: float = 1.0) -> list[float]:
         """Success of each try: the counts, and a guess with a weight in tries.
 
-        Of the first try that is `prior`; of a later one what came out for the try before, which it goes below as in `prior`.
+        Of the first try that is `prior`; of a later one what came out for the try before, which it goes below as in `prior`,
+        beyond its end by the factor `falling_off`.
         """
         result: list[float] = []
         for k in range(max(len(self.attempts), len(prior))):
@@ -209,7 +220,7 @@ class Statistics:
             elif k < len(prior):
                 guess, trust = result[-1] * min(prior[k] / max(prior[k - 1], 1e-12), 1.0), weight
             else:
-                guess, trust = result[-1], NEXT_TRY
+                guess, trust = falling_off * result[-1], NEXT_TRY
             if k < len(self.attempts):
                 guess = (self.successes[k] + trust * guess) / (self.attempts[k] + trust)
             result.append(guess)
@@ -285,12 +296,14 @@ class _Outlook:
 
     trust: weight of an operator's pooled success in what is expected after a history, in tries. slowness: device seconds over
     guessed ones. ease: success over the guessed one, per loop. surprise: by how much those that do better than guessed do so.
+    falling_off: success of a further try over that of the one before.
     """
 
     trust: float = 1.0 / CORRELATION - 1.0
     slowness: float = 1.0
     ease: float = 1.0
     surprise: float = SURPRISE
+    falling_off: float = FALLING_OFF
 
 
 class _Operator:
@@ -311,7 +324,7 @@ class _Operator:
     def predict(self, outlook: _Outlook) -> None:
         known = self.statistics
         prior = self.guessed(outlook.ease)
-        self.hazards = known.hazards([prior], PRIOR_TRIES)
+        self.hazards = known.hazards([prior], PRIOR_TRIES, outlook.falling_off)
         # The guessed cost counts only until a cost was seen: it may be wrong by orders of magnitude.
         self.seconds_per_try = known.seconds / known.tries if known.tries else outlook.slowness * self.guess
         self.within = _within(self.hazards)
@@ -644,7 +657,9 @@ class _Records:
         known = [operator for operator in self._operators.values() if operator.statistics.tries]
         general, of_operator = self._correlations()
         ease = _ease(known)
-        self._outlook = _Outlook(_weight_of_mean(general), _slowness(known), ease, _surprise(known, ease))
+        self._outlook = _Outlook(
+            _weight_of_mean(general), _slowness(known), ease, _surprise(known, ease), _falling_off(known)
+        )
         for operator in self._operators.values():
             operator.trust = _weight_of_mean(of_operator.get(operator, general))
             operator.predict(self._outlook)
@@ -1030,6 +1045,14 @@ class Tree(_Records):
             return path
         self._stale |= self._records_since_refresh > DISAPPOINTED
         return incumbent
+
+    def hopeless(self, path: Path) -> bool:
+        """Whether what is known of a sequence tells that it is far below the incumbent, whatever its other steps do."""
+        if not self._incumbent:
+            return False
+        components, _ = self._made_along(path)
+        cost = sum(self._renewed(history).believed_cost for history in components)
+        return cost * HOPELESS * self._rate_now(self._incumbent) > 1.0
 
     def _promising(self, price: float) -> Path:
         """The sequence that the tree chooses by Q and bonus, step by step; () where none is ready."""
@@ -1537,6 +1560,20 @@ def _surprise(operators: Iterable[_Operator], ease: float) -> float:
             if more > 0.0:
                 total, count = total + more**2, count + 1.0
     return math.sqrt(total / count)
+
+
+def _falling_off(operators: Iterable[_Operator]) -> float:
+    """Geometric mean of the success of further tries over that of the try before, at most 1: how easy conditions that failed
+    are on an instance differs from others more than between operators."""
+    total, weight = FALLING_OFF_TRIES * math.log(FALLING_OFF), FALLING_OFF_TRIES
+    for operator in operators:
+        attempts, successes = operator.statistics.attempts, operator.statistics.successes
+        for k in range(1, len(attempts)):
+            if attempts[k] >= VISIT_TRIES and successes[k - 1] > 0.0:
+                ratio = (successes[k] + 0.5) / (attempts[k] + 1.0) * attempts[k - 1] / successes[k - 1]
+                trust = min(attempts[k], FALLING_OFF_TRIES)
+                total, weight = total + trust * math.log(ratio), weight + trust
+    return min(math.exp(total / weight), 1.0)
 
 
 def guessed_success(graph: ConstraintGraph, problem: Problem) -> tuple[int, float]:

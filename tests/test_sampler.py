@@ -96,6 +96,16 @@ def test_the_tree_pursues_its_first_sequence_to_the_end_and_explores_in_small_ba
     assert explored and max(explored) <= 512 // 4
 
 
+@pytest.mark.parametrize("hopeless", [False, True])
+def test_a_look_goes_on_to_the_next_step_unless_there_is_no_hope(hopeless, monkeypatch):
+    begun = sampler("tree")
+    sequences = problem("pick_place").transitions.parse("t; q2; q1"), problem("pick_place").transitions.parse("t; q1; q2")
+    monkeypatch.setattr(begun.chooser, "select", lambda ready: sequences[0])
+    monkeypatch.setattr(begun.chooser, "hopeless", lambda path: hopeless and path == sequences[1])
+    begun._pursued, begun._patience, begun._ended = sequences[1], 4, True
+    assert begun._choose() == sequences[not hopeless]
+
+
 @pytest.mark.parametrize(("waiting", "looked_at"), [(15, "t"), (16, "q1")])
 def test_a_first_look_takes_few_conditions(waiting, looked_at):
     begun = sampler("t; q1; q2", batch_size=2048)

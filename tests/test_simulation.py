@@ -57,7 +57,7 @@ def test_a_further_try_succeeds_as_often_as_it_did():
     for i in (1, 2):
         tree.record(path[:i], path[i], [TRIES, TRIES // 2], [TRIES // 2, TRIES // 8], 10.0)
     world = World(problem("pick_place"), [tree.as_json()])
-    assert world.hazards(history_of(path[:2])) == pytest.approx([0.5, 0.25, 0.25 * 0.6, 0.25 * 0.6**2], rel=1e-5)
+    assert world.hazards(history_of(path[:2])) == pytest.approx([0.5, 0.25, 0.25 * 0.8, 0.25 * 0.8**2], rel=1e-5)
     with pytest.raises(InputError, match="no operator was tried"):
         World(problem("pick_place"), [])
 

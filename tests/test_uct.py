@@ -14,6 +14,7 @@ from cgs_jax.uct import (
     CURIOSITY,
     CURIOUS_EVERY,
     DISAPPOINTED,
+    FALLING_OFF,
     KEEN_AFTER,
     KEEN_CURIOSITY,
     PROMISE,
@@ -502,6 +503,41 @@ def test_a_warm_start_keeps_how_further_tries_fall_off_where_instances_differ():
     warm = Tree(transitions)
     warm.warm_start(earlier, n_equiv=5)
     assert warm._operator(step.problem).hazards[1] == pytest.approx(0.1, abs=0.05)
+
+
+def test_further_tries_that_were_not_made_fall_off_as_those_of_other_operators_do():
+    """a and then b given a, whose second tries succeed half as often; of (a,b) only first tries are known."""
+    transitions = pair_graph()
+    one, other = transitions.parse("a; b"), transitions.parse("(a,b)")
+    tree = Tree(transitions, discount=1.0)
+    for _ in range(50):
+        tree.record((), one[0], 100, 100, 0.1)
+        tree.record(one[:1], one[1], [100, 60, 40], [40, 12, 4], 0.1)
+    tree.record((), other[0], [1000, 0, 0], [500, 0, 0], 0.1)
+    tree.select()
+    hazards = tree._operator(other[0].problem).hazards
+    assert hazards[0] == pytest.approx(0.5, abs=0.01)
+    assert hazards[1] / hazards[0] == pytest.approx(0.5, abs=0.1) and hazards[2] / hazards[1] == pytest.approx(0.5, abs=0.1)
+    fresh = Tree(transitions, discount=1.0)
+    fresh.record((), other[0], [1000, 0], [500, 0], 0.1)
+    fresh.select()
+    assert fresh._operator(other[0].problem).hazards[1] == pytest.approx(FALLING_OFF * 0.5, abs=0.01)
+
+
+def test_a_sequence_that_is_far_below_the_incumbent_is_hopeless():
+    """a; b makes 25 samples/s. b; a cannot make one, as b succeeds twice in 128 tries; (a,b) makes half of the best."""
+    transitions = pair_graph()
+    best, poor, half = (transitions.parse(text) for text in ("a; b", "b; a", "(a,b)"))
+    tree = Tree(transitions)
+    assert not tree.hopeless(poor)
+    for _ in range(20):
+        tree.record((), best[0], 100, 50, 1.0)
+        tree.record(best[:1], best[1], 50, 50, 1.0)
+    tree.select()
+    assert tree.incumbent == best
+    tree.record((), poor[0], 128, 2, 2.56)
+    tree.record((), half[0], 128, 32, 2.56)
+    assert tree.hopeless(poor) and not tree.hopeless(half) and not tree.hopeless(best)
 
 
 def test_the_incumbent_is_run_while_others_promise_little_more():

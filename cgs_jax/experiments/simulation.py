@@ -36,7 +36,7 @@ KNOWN_TRIES = 60
 SPREAD = 0.35
 """Greatest standard deviation of the logarithm of an operator's success over histories that were hardly tried."""
 
-FALLING_OFF = 0.6
+FALLING_OFF = 0.8
 """Success of a further try over that of the one before, where few were made."""
 
 LEAST_STEPS = 4.0
