@@ -316,7 +316,7 @@ class _Crew:
     """Who runs batches: worker processes where the problem can be loaded there, and this process until they have arrived."""
 
     def __init__(self, runner: BatchRunner, workers: int, setup: Setup | None) -> None:
-        self._free: list[BatchRunner | Worker] = []
+        self._free: list[BatchRunner | Worker] = []  # a worker as often as it may be asked
         self._line: list[_Request] = []
         self._changed = threading.Condition()
         self._wanted = workers
@@ -350,7 +350,7 @@ class _Crew:
                 # With all workers there, this process has its core for compiling and deciding.
                 if self._complete() and self._local in self._free:
                     self._free.remove(self._local)
-                for member in self._free:
+                for member in sorted(self._free, key=self._free.count, reverse=True):
                     if next((r for r in self._line if self._suits(r, member)), None) is request:
                         self._line.remove(request)
                         self._free.remove(member)
@@ -382,6 +382,8 @@ class _Crew:
                 if worker.await_ready():
                     self._arrived.append(worker)
                     self._seat(worker)
+                    # What it runs next is there when a batch ends.
+                    self._release(worker)
             except Exception as error:  # noqa: BLE001 - raised by the next batch
                 self._refusal = error
 
@@ -591,7 +593,7 @@ class Sampler:
         yield Started(start - begun)
         found = 0
         reason = "time"
-        threads = ThreadPoolExecutor(self.settings.workers + 1, thread_name_prefix="sample")
+        threads = ThreadPoolExecutor(2 * self.settings.workers, thread_name_prefix="sample")
         in_flight: list[tuple[Job | list[Candidates], Future[Any]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
         try:

@@ -14,6 +14,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,11 @@ class Install:
 
 
 class Worker:
-    """A batch runner in another process; one batch at a time. Made by `hire`."""
+    """A batch runner in another process. Made by `hire`.
+
+    Threads may ask at the same time: a batch that is sent while another one runs is there when that ends. Answers come in the
+    order of the questions.
+    """
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -80,6 +85,9 @@ class Worker:
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
+        self._sending = threading.RLock()
+        self._answering = threading.Condition()
+        self._asked = self._answered = 0
         self._send(cache.SOURCES)
         self._failed = False
         self._installed: set[int] = set()
@@ -97,15 +105,16 @@ class Worker:
 
     def install(self, identity: int, programs: Sequence[Program], aimed: AimedTables) -> None:
         """Makes sure that the worker has the programs and seed tables of an operator; they are made in one process only."""
-        if identity in self._installed:
-            return
-        self._installed.add(identity)
-        if any(program.portable is None for program in programs):
-            return  # it makes its own, from JAX's cache
-        numbers = tuple(program.number for program in programs)
-        missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
-        self._sent.update(missing)
-        self._send(Install(identity, numbers, missing, aimed))
+        with self._sending:
+            if identity in self._installed:
+                return
+            self._installed.add(identity)
+            if any(program.portable is None for program in programs):
+                return  # it makes its own, from JAX's cache
+            numbers = tuple(program.number for program in programs)
+            missing = {n: p.portable for n, p in zip(numbers, programs, strict=True) if n not in self._sent}
+            self._sent.update(missing)
+            self._send(Install(identity, numbers, missing, aimed))
 
     def has(self, program: Program) -> bool:
         """Whether a program was sent to it."""
@@ -145,8 +154,17 @@ class Worker:
 
     def _ask(self, message: Batch | Aim | Audit) -> Any:
         try:
-            self._send(message)
-            answer = pickle.load(self._pipe_from())
+            with self._sending:
+                self._send(message)
+                turn, self._asked = self._asked, self._asked + 1
+            with self._answering:
+                self._answering.wait_for(lambda: self._answered == turn)
+            try:
+                answer = pickle.load(self._pipe_from())
+            finally:
+                with self._answering:
+                    self._answered += 1
+                    self._answering.notify_all()
         except (EOFError, OSError) as error:
             raise RuntimeError(f"a worker process ended: {error}") from error
         if isinstance(answer, BaseException):

@@ -1,9 +1,11 @@
 """Compiled programs: what belongs to their key, and what happens to one that is damaged or foreign."""
 
+import dataclasses
 import io
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -178,6 +180,18 @@ def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
     assert seen[0] and seen[0] <= seen[1]
     for one in worker._idle:
         one.close()
+
+
+def test_a_worker_that_several_threads_ask_gives_each_its_answer(monkeypatch):
+    monkeypatch.setattr(worker, "_idle", [])
+    at, batch = grasps()
+    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None, None))
+    assert one.await_ready()
+    with ThreadPoolExecutor(4) as threads:
+        questions = [dataclasses.replace(batch, tasks=count) for count in range(1, SMALL.batch_size + 1)]
+        answers = list(threads.map(one.run, questions))
+    one.close()
+    assert [len(answer.success) for answer in answers] == [question.tasks for question in questions]
 
 
 def test_a_worker_that_failed_is_not_kept(monkeypatch):
