@@ -704,7 +704,6 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
     from cgs_jax.experiments.measures import final_rate
     from cgs_jax.experiments.runs import Store
     from cgs_jax.experiments.simulation import World, simulate
-    from cgs_jax.uct import Fixed
 
     if given.study is None:
         raise InputError("search reads what the runs of a study learned, expected --study DIR")
@@ -720,7 +719,8 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
             shares = []
             for seed in range(given.seed, given.seed + given.rounds):
                 world = World(problem, trees, seed)
-                best = simulate(world, Fixed(problem.transitions, world.best), seed, seconds)
+                named = problem.transitions.format(world.best)
+                best = simulate(world, make_chooser(problem, named, seed), seed, seconds)
                 chooser = make_chooser(problem, given.method, seed)
                 found = simulate(world, chooser, seed, seconds)
                 ended = chooser.best_sequences(1)
@@ -730,7 +730,7 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
                         "early": (found <= early).sum() / early / final_rate(best, seconds),
                         "final": final_rate(found, seconds) / final_rate(best, seconds),
                         "end": world.rate(ended[0][0]) / world.best_rate if ended else 0.0,
-                        "best": problem.transitions.format(world.best),
+                        "best": named,
                     }
                 )
             rows[str(instance)] = {name: [share[name] for share in shares] for name in ("early", "final", "end", "best")}
