@@ -85,7 +85,7 @@ class Worker:
             stdout=subprocess.PIPE,
             env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
-        self._sending = threading.RLock()
+        self._sending = threading.Lock()
         self._answering = threading.Condition()
         self._asked = self._answered = 0
         self._send(cache.SOURCES)

@@ -721,14 +721,17 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
                 world = World(problem, trees, seed)
                 named = problem.transitions.format(world.best)
                 best = simulate(world, make_chooser(problem, named, seed), seed, seconds)
+                attainable = final_rate(best, seconds)
+                if not attainable:
+                    raise InputError(f"the best sequence of {scene} makes nothing in {seconds:g} s, expected more --seconds")
                 chooser = make_chooser(problem, given.method, seed)
                 found = simulate(world, chooser, seed, seconds)
                 ended = chooser.best_sequences(1)
                 early = 0.2 * seconds
                 shares.append(
                     {
-                        "early": (found <= early).sum() / early / final_rate(best, seconds),
-                        "final": final_rate(found, seconds) / final_rate(best, seconds),
+                        "early": (found <= early).sum() / early / attainable,
+                        "final": final_rate(found, seconds) / attainable,
                         "end": world.rate(ended[0][0]) / world.best_rate if ended else 0.0,
                         "best": named,
                     }

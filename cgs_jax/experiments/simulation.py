@@ -1,4 +1,4 @@
-"""Simulated runs: the real scheduling and the real tree against a truth that is known, in a fifth of the time.
+"""Simulated runs: the real scheduling and the real tree against a truth that is known.
 
 How near the search comes to the best sequence cannot be told from a few runs: neighbouring ones differ by a tenth or two on a
 busy machine, and what the best sequence would have made is not known. Here every history has a success and every operator a
@@ -189,7 +189,7 @@ def simulate(
     """
     settings = replace(settings or SamplerSettings(), tries=world.tries)
     sampler = Sampler(world.problem, chooser, seed, settings)
-    run = _batches(world, sampler, np.random.default_rng(seed), settings)
+    run = _batches(world, np.random.default_rng(seed), settings)
     free = [0.0] * settings.workers
     in_flight: list[tuple[float, Job, Outcome]] = []
     now, finished = 0.0, list[float]()
@@ -210,9 +210,7 @@ def simulate(
         finished += [now] * sum(part.size for part in sampler.take_candidates())
 
 
-def _batches(
-    world: World, sampler: Sampler, random: np.random.Generator, settings: SamplerSettings
-) -> Callable[[int, Job], Outcome]:
+def _batches(world: World, random: np.random.Generator, settings: SamplerSettings) -> Callable[[int, Job], Outcome]:
     """What comes of a job that a worker runs."""
     work = _work(world, settings)
     ran: set[tuple[int, int]] = set()  # worker and operator
