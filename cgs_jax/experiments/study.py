@@ -87,7 +87,7 @@ QUICK = Budget(
     operation_seconds=2.0,
 )
 
-FULL = Budget(seconds=10.0, seeds=5)
+FULL = Budget(seconds=15.0, seeds=5)
 
 
 @dataclass(frozen=True)
