@@ -596,6 +596,16 @@ class Sampler:
         threads = ThreadPoolExecutor(2 * self.settings.workers, thread_name_prefix="sample")
         in_flight: list[tuple[Job | list[Candidates], Future[Any]]] = []
         done: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+        def wanted(candidates: list[Candidates], audited: Audited) -> Iterator[Found]:
+            """What passed, cut to the number of samples."""
+            nonlocal found
+            for event in self._found(candidates, audited, clock() - start):
+                if num_samples is not None:
+                    event = _first(event, num_samples - found)
+                found += len(event.qpos)
+                yield event
+
         try:
             while True:
                 elapsed = clock() - start
@@ -638,18 +648,14 @@ class Sampler:
                 if isinstance(work, Job):
                     yield self.absorb(work, future.result())
                     continue
-                for event in self._found(work, future.result(), clock() - start):
-                    if num_samples is not None and found + len(event.qpos) > num_samples:
-                        event = _first(event, num_samples - found)
-                    found += len(event.qpos)
-                    yield event
+                yield from wanted(work, future.result())
             # What was finished in time is not thrown away.
             for work, future in in_flight:
                 if not isinstance(work, Job) and reason != "samples":
-                    yield from self._found(work, future.result(), clock() - start)
+                    yield from wanted(work, future.result())
             if self._candidates and reason != "samples":
                 rest = self.take_candidates()
-                yield from self._found(rest, self._runner.audit(_together(rest)), clock() - start)
+                yield from wanted(rest, self._runner.audit(_together(rest)))
         finally:
             threads.shutdown(wait=True, cancel_futures=True)
             crew.close()

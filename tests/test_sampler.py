@@ -212,6 +212,18 @@ def test_stop_ends_the_run_after_the_batches_in_flight():
     assert len(of(Found, events)) >= 1
 
 
+def test_a_run_that_is_stopped_makes_no_more_samples_than_were_wanted():
+    at_work = sampler()
+    events = []
+    for event in at_work.events(60.0, 3):
+        events.append(event)
+        # Full samples wait for their audit at this moment.
+        if isinstance(event, Ran) and event.position == len(event.path) - 1 and event.cleared > 3:
+            at_work.stop()
+    assert events[-1].reason == "interrupt"
+    assert sum(len(event.qpos) for event in of(Found, events)) == 3
+
+
 def test_the_budget_ends_the_run():
     events = run(budget=0.3, number=None, deterministic=False)
     assert events[-1].reason == "time" and 0.3 <= events[-1].elapsed < 3.0
