@@ -30,12 +30,9 @@ from cgs_jax.batches import Audited, Batch, BatchRunner, BatchSettings, Outcome,
 from cgs_jax.cache import cache_folder
 from cgs_jax.operators import Operator, operator_of
 from cgs_jax.problems import Collisions, Problem, with_collisions
-from cgs_jax.transitions import Transition
+from cgs_jax.transitions import Path, Transition
 from cgs_jax.uct import Chooser
 from cgs_jax.worker import Setup, Worker, dismiss, hire
-
-Path = tuple[Transition, ...]
-
 
 # ------------------------------------------------------------------ events: the one record of a run
 

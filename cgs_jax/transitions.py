@@ -72,6 +72,10 @@ class Transition:
         return self.new[0] if len(self.new) == 1 else f"({','.join(self.new)})"
 
 
+Path = tuple[Transition, ...]
+"""Transitions in turn, from the empty set on; a complete sequence ends with the full one."""
+
+
 class Transitions:
     """The kept transitions of a constraint graph, listed lazily and remembered."""
 
@@ -122,10 +126,10 @@ class Transitions:
             found = self._children[key] = self._list_children(self._mask(self.graph.ordered(key)), key)
         return found
 
-    def sequences(self) -> Iterator[tuple[Transition, ...]]:
+    def sequences(self) -> Iterator[Path]:
         """All complete sequences, depth first in the order of children()."""
 
-        def extend(path: tuple[Transition, ...], state: State) -> Iterator[tuple[Transition, ...]]:
+        def extend(path: Path, state: State) -> Iterator[Path]:
             if state == self.full:
                 yield path
             for transition in self.children(state):
@@ -140,7 +144,7 @@ class Transitions:
             count[transition.target] += count[transition.given]
         return count[self.full]
 
-    def parse(self, sequence: str | Iterable[str | Iterable[str]]) -> tuple[Transition, ...]:
+    def parse(self, sequence: str | Iterable[str | Iterable[str]]) -> Path:
         """The path written as "t_b; t_a; (q_a2,p); ..." or as a list of lists of names.
 
         Raises InputError naming the first step that is no kept transition and what is available there.

@@ -18,7 +18,7 @@ SCRIPTS = sorted((ROOT / "scripts").glob("*.py"))
 
 # Each module and all that it may know of. Two towers that never import each other: the search, which knows no scene and
 # no JAX, and the mathematics, which knows no graph; a thin bridge over both, and the porch.
-GRAPH = {"errors", "graph", "transitions", "uct"}
+GRAPH = {"errors", "graph", "transitions", "histories", "uct"}
 MATHEMATICS = {
     "poses", "distance", "augmented_lagrangian", "kinematics", "constraints", "collisions", "plans", "seeds", "tables", "costs",
 }  # fmt: skip
@@ -27,7 +27,8 @@ MAY_IMPORT = {
     "errors": set(),
     "graph": {"errors"},
     "transitions": {"errors", "graph"},
-    "uct": {"errors", "graph", "transitions"},
+    "histories": {"errors", "graph", "transitions"},
+    "uct": {"errors", "histories", "transitions"},
     # the mathematics
     "poses": set(),
     "distance": set(),
@@ -81,7 +82,7 @@ MAY_IMPORT = {
 }  # fmt: skip
 
 # Packages that a module may name at its top, beside the standard library; what is not listed may use NumPy, JAX and MuJoCo.
-PLAIN = {"errors": set(), "graph": set(), "transitions": set(), "uct": {"numpy"}}
+PLAIN = {"errors": set(), "graph": set(), "transitions": set(), "histories": set(), "uct": set()}
 HOST = {
     "scene": {"numpy", "mujoco"},
     "samples": {"numpy"},

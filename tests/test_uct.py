@@ -6,24 +6,21 @@ import numpy as np
 import pytest
 from paper_graphs import banana, handover, pick_place, regrasps
 
-from cgs_jax import uct
+from cgs_jax import histories
 from cgs_jax.errors import InputError
 from cgs_jax.graph import Constraint, ConstraintGraph, Variable
+from cgs_jax.histories import FALLING_OFF, Statistics, _surprise, guessed_success
 from cgs_jax.transitions import Transitions
 from cgs_jax.uct import (
     CURIOSITY,
     CURIOUS_EVERY,
     DISAPPOINTED,
-    FALLING_OFF,
     KEEN_AFTER,
     KEEN_CURIOSITY,
     PROMISE,
     Fixed,
     Random,
-    Statistics,
     Tree,
-    _surprise,
-    guessed_success,
 )
 
 
@@ -107,14 +104,14 @@ def test_golden_tree_by_hand():
     # Operators: the guess with the weight of two tries; histories: their operator's mean by the guessed correlation, since
     # no operator has two of them. a closes no loop; b after a has one degree of freedom left for its loop, and loops
     # succeeded more often than guessed: the mean over this one and three as guessed.
-    weight = 1 / uct.CORRELATION - 1
+    weight = 1 / histories.CORRELATION - 1
     ease = (10.5 / 51 / 0.1) ** (1 / 4)
     p_a = (50 + weight * (50 + 2 * 0.8) / 102) / (100 + weight)
     p_b = (10 + weight * (10 + 2 * 0.1 * ease) / 52) / (50 + weight)
 
     def hopeful(p, tries):
         """The mean and a share of the standard deviation of the beta distribution that is known so far."""
-        return p + uct.HOPE * math.sqrt(p * (1 - p) / (tries + weight + 1))
+        return p + histories.HOPE * math.sqrt(p * (1 - p) / (tries + weight + 1))
 
     assert tree.predict_rate(a_first) == pytest.approx(p_a * p_b / (0.01 + p_a * 0.01))
     # (a,b) never ran: three degrees of freedom are left for its loop, and time goes by guesses, which were too low.
@@ -138,7 +135,7 @@ def test_guessed_success_by_hand():
     at = {(t.new, t.condition): t.problem for t in transitions.iterate()}
 
     def guess(new, given=()):
-        return uct.guessed_success(graph, at[graph.ordered(new), frozenset(given)])
+        return guessed_success(graph, at[graph.ordered(new), frozenset(given)])
 
     assert guess(["t_a"]) == (0, 0.8)  # drawn
     assert guess(["q_a1"], ["t_a"]) == (1, pytest.approx(0.1))  # 7 - 6

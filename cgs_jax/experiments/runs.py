@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from cgs_jax.problems import Problem
 from cgs_jax.record import Recorder, operator_text, write_json
 from cgs_jax.sampler import Compiled, Sampler, SamplerSettings
-from cgs_jax.transitions import Transition, Transitions
-from cgs_jax.uct import Chooser, Path, Ready, Tree
+from cgs_jax.transitions import Path, Transition, Transitions
+from cgs_jax.uct import Chooser, Ready, Tree
 
 
 @dataclass(frozen=True)

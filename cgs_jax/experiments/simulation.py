@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from cgs_jax.batches import Outcome
 from cgs_jax.errors import InputError
 from cgs_jax.experiments.runs import merged_tree
+from cgs_jax.histories import guessed_success, read_prefix
 from cgs_jax.operators import operator_of
 from cgs_jax.problems import Problem
 from cgs_jax.sampler import BATCH_SECONDS, DRAIN, Job, Sampler, SamplerSettings, squared_unknowns
+from cgs_jax.transitions import Path, State
 from cgs_jax.transitions import Problem as Conditional
-from cgs_jax.transitions import State, Transition
-from cgs_jax.uct import Chooser, guessed_success, read_prefix
+from cgs_jax.uct import Chooser
 
-Path = tuple[Transition, ...]
 Floats = NDArray[np.float64]
 History = tuple[Conditional, frozenset]
 """How a component came about: the conditional problem that made it, and the histories that it read."""

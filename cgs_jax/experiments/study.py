@@ -37,7 +37,8 @@ from cgs_jax.experiments.runs import (
 from cgs_jax.problems import Problem, load_problem
 from cgs_jax.record import operator_text, write_json
 from cgs_jax.sampler import SamplerSettings
-from cgs_jax.uct import Path, Tree
+from cgs_jax.transitions import Path
+from cgs_jax.uct import Tree
 
 RUN_OVERHEAD = 0.4
 """Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
