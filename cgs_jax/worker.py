@@ -192,6 +192,13 @@ class Worker:
 
 
 _idle: list[Worker] = []
+_most_idle = os.cpu_count() or 1
+
+
+def keep(count: int) -> None:
+    """How many workers may wait for another run: one for each core unless this says otherwise."""
+    global _most_idle
+    _most_idle = count
 
 
 def hire(setup: Setup) -> Worker:
@@ -208,8 +215,8 @@ def hire(setup: Setup) -> Worker:
 
 
 def dismiss(worker: Worker) -> None:
-    """Keeps a worker that waits for work until the next run; it ends with this process. One is kept for each core."""
-    if worker.usable and len(_idle) < (os.cpu_count() or 1):
+    """Keeps a worker that waits for work until the next run (`keep`); it ends with this process."""
+    if worker.usable and len(_idle) < _most_idle:
         _idle.append(worker)
     else:
         worker.close()

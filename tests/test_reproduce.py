@@ -4,16 +4,20 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import made_up
 import numpy as np
 import pytest
+from loaded import problem
 from made_up import PAPER
 from paper_graphs import handover
 
+from cgs_jax.api import make_chooser
 from cgs_jax.errors import InputError
 from cgs_jax.experiments import Budget, Study, claims, measures, runs, study, write_report
+from cgs_jax.sampler import SamplerSettings
 from cgs_jax.transitions import Transitions
 from cgs_jax.uct import Tree
 
@@ -78,10 +82,23 @@ def test_methods_are_compared_over_the_seeds_that_both_have():
     assert measures.side_by_side([4.0, 6.0, 1.0], [2.0, 2.0]) == ([4.0, 6.0], [2.0, 2.0])
     cells = {"tree": {"cells": [40, 60, 10]}, "expert": {"cells": [20, 30]}}
     assert measures.relative_to_tree([{"variables": {"x": {"methods": cells}}}], "x", "expert", "cells") == [0.4, 0.6]
-    methods = {"tree": {"final": [4.0, 6.0, 1.0]}, "expert": {"final": [2.0, 2.0]}}
-    scene = {"sequences": {"expert": ""}, "instances": [{"instance": 0, "methods": methods}]}
-    (entry,) = claims.expert_ratios(scene)
-    assert entry["ratio"] == pytest.approx(2.5)
+
+
+def test_the_best_sequence_beside_tree_is_the_oracle():
+    sequences = {"best expert": "a; b", "best found": "(a,b)"}
+    final = {"tree": [4.0, 6.0], "best expert": [2.0, 2.0], "best found": [3.0, 5.0]}
+    alone = {"tree": [4.0], "best expert": [5.0]}
+    scene = {
+        "turns": [
+            {"instance": 0, "expert": "expert2", "final": final, "sequences": sequences},
+            {"instance": 1, "expert": "expert1", "final": alone, "sequences": {"best expert": "a; b"}},
+        ]
+    }
+    experts = claims.expert_ratios(scene)
+    assert [(e["expert"], e["ratio"]) for e in experts] == [("expert2", pytest.approx(2.5)), ("expert1", pytest.approx(0.8))]
+    (oracle,) = claims.oracle_ratios(scene)
+    assert (oracle["label"], oracle["sequence"], oracle["rate"]) == ("best found", "(a,b)", 4.0)
+    assert oracle["ratio"] == pytest.approx(1.25)
 
 
 # ------------------------------------------------------------------ sequences
@@ -142,7 +159,7 @@ def test_operation_is_named_as_in_the_record():
 BUDGET = Budget(
     seconds=2.0, seeds=2, instances=2, coverage_least=20, sweep_instances=1, sweep_seeds=1, prices=(0.1, 1.0),
     exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, screened=3, screen_seconds=0.5,
-    top=2, top_seeds=1, operation_seconds=0.5,
+    printed_seconds=0.5, turns_seconds=1.0, turns_seeds=2, operation_seconds=0.5,
 )  # fmt: skip
 
 
@@ -155,8 +172,12 @@ def finished(tmp_path_factory):
         made.append(run)
         return made_up.run(problem, chooser, run, *arguments, **named)
 
+    def record_in_turns(problem, choosers, runs, settings):
+        return [record(problem, chooser, run, settings) for chooser, run in zip(choosers, runs, strict=True)]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "execute", record)
+        patch.setattr(study, "execute_in_turns", record_in_turns)
         patch.setattr(study, "prepare", lambda problem, settings: iter(()))
         whole = Study(tmp_path_factory.mktemp("study"), ["handover"], BUDGET, PAPER)
         progress = list(whole.execute())
@@ -174,6 +195,45 @@ def test_study_makes_every_run_once_and_goes_on_where_it_stopped(finished):
     assert made[count:] == [lost]
     del made[count:]
     assert whole.estimate() == 0.0
+
+
+def test_what_ran_side_by_side_is_run_again_together(finished):
+    whole, made, _ = finished
+    lost = next(run for run in made if (run.stage, run.method, run.seed) == ("turns", "best expert", 1))
+    (whole.store.folder / f"{lost.key}.json").unlink()
+    count = len(made)
+    list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
+    assert [(run.method, run.seed) for run in made[count:]] == [("tree", 1), ("best expert", 1), ("best found", 1)]
+    assert {(run.instance, run.seconds) for run in made[count:]} == {(0, 1.0)}
+    del made[count:]
+
+
+def test_side_by_side_everyone_has_its_own_time_and_waits_for_the_others(monkeypatch):
+    at = problem("pick_place")
+    turns = []
+    go_on = runs._Competitor.go_on
+
+    def spy(self, seconds):
+        turns.append(self)
+        go_on(self, seconds)
+
+    monkeypatch.setattr(runs, "TURN", 0.2)
+    monkeypatch.setattr(runs._Competitor, "go_on", spy)
+    settings = SamplerSettings(batch_size=128, lanes=32, workers=1)
+    sequences = at.scene.task.sequences
+    both = [runs.Run("turns", "pick_place", 0, name, 0, 0.6) for name in list(sequences)[1:3]]
+    for run in both:  # programs
+        runs.execute(at, make_chooser(at, run.method, 0), run, settings)
+    turns.clear()
+    began = time.perf_counter()
+    first, second = runs.execute_in_turns(at, [make_chooser(at, run.method, 0) for run in both], both, settings)
+    passed = time.perf_counter() - began
+    assert turns[0] is not turns[1] and turns[::2].count(turns[0]) >= 3 and turns[1::2].count(turns[1]) >= 3
+    for kept, run in ((first, both[0]), (second, both[1])):
+        assert kept.data["meta"]["ended_by"] == "time" and list(kept.data["sequences"]) == [sequences[run.method]]
+        assert 0.6 <= kept.data["meta"]["elapsed"] < 0.6 + 0.5 * passed
+        assert len(kept.elapsed) and kept.elapsed.max() > 0.3
+    assert passed > first.data["meta"]["elapsed"] + second.data["meta"]["elapsed"] - 0.01
 
 
 def test_folder_of_another_budget_is_refused(finished):
@@ -225,10 +285,9 @@ def test_claims_are_confronted_with_the_numbers(finished):
     assert not claim("more sensitive").passed  # all rates double on the second instance
     for instance in numbers["scenes"]["handover"]["instances"]:
         instance["methods"]["tree"]["final"] = [90.0, 80.0]
-        instance["methods"]["tree"]["max_violation"] = 2e-4
-    for oracle in numbers["scenes"]["handover"]["oracle"]:
-        for entry in oracle["measured"].values():
-            entry["tree"] = [90.0, 80.0]
+    for turns in numbers["scenes"]["handover"]["turns"]:
+        turns["final"]["tree"] = [90.0, 80.0]
+    numbers["scenes"]["handover"]["audited"]["max_violation"] = 2e-4
     by_text = {claim.text: claim for claim in claims.confront(numbers)}
     assert claim("0.95 of the best expert").passed is False and "handover 1" in claim("0.95 of the best expert").reason
     assert claim("fixed sequence's, found by any means").passed is False

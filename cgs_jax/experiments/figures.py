@@ -227,6 +227,15 @@ def sweep(scene: Mapping[str, Any], path: Path) -> None:
         _save(figure, path)
 
 
+TRIED = {
+    "screened": (".", 4, "screened shortly"),
+    "printed": ("s", 5, "found in the paper"),
+    "experts": ("^", 5, "experts"),
+    "found": ("o", 5, "best found, beside tree"),
+}
+"""Marker, its size and a title of the fixed sequences that were run."""
+
+
 def oracle(scene: Mapping[str, Any], path: Path) -> None:
     """All sequences by predicted rate, and predicted against measured rates."""
     colours = plt.get_cmap("viridis")(np.linspace(0.0, 0.9, len(scene["oracle"])))
@@ -242,16 +251,11 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
             left.plot(np.arange(1, len(predicted) + 1), predicted, color=colour, lw=1.5, label=label)
             tree = float(np.mean(finals(by_number[entry["instance"]], "tree")))
             left.plot([0.85], [tree], ">", color=colour, ms=6, clip_on=False)
-            for tried in entry["screened"]:
-                if tried["predicted"] and tried["rate"] > 0:
-                    points.append((tried["predicted"], tried["rate"]))
-                    right.plot(tried["predicted"], tried["rate"], ".", color=colour, ms=4, alpha=0.5)
-            for label, measured in entry["measured"].items():
-                real = float(np.mean(measured["final"]))
-                if measured["predicted"] and real > 0:
-                    marker = "o" if label.startswith("screened") else "s" if label.startswith("paper") else "^"
-                    points.append((measured["predicted"], real))
-                    right.plot(measured["predicted"], real, marker, color=colour, ms=5, alpha=0.85)
+            for kind, (marker, size, _) in TRIED.items():
+                for tried in [entry[kind]] if kind == "found" else entry[kind]:
+                    if tried["predicted"] and tried["rate"] > 0:
+                        points.append((tried["predicted"], tried["rate"]))
+                        right.plot(tried["predicted"], tried["rate"], marker, color=colour, ms=size, alpha=0.7)
         left.set_xscale("log")
         left.set_yscale("log")
         left.set_xlim(left=0.85)
@@ -264,7 +268,7 @@ def oracle(scene: Mapping[str, Any], path: Path) -> None:
         if points:
             low, high = np.min(points), np.max(points)
             right.plot([low, high], [low, high], color="#999999", lw=0.9, ls=":")
-        for marker, label in ((".", "screened shortly"), ("o", "best of these"), ("s", "found in the paper"), ("^", "experts")):
+        for marker, _, label in TRIED.values():
             right.plot([], [], marker, color="#555555", label=label)
         right.set_xscale("log")
         right.set_yscale("log")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
 from typing import Any
@@ -13,9 +15,12 @@ from numpy.typing import NDArray
 
 from cgs_jax.problems import Problem
 from cgs_jax.record import Recorder, operator_text, write_json
-from cgs_jax.sampler import Compiled, Sampler, SamplerSettings
+from cgs_jax.sampler import Compiled, Event, Sampler, SamplerSettings, Started
 from cgs_jax.transitions import Path, Transition, Transitions
 from cgs_jax.uct import Chooser, Ready, Tree
+
+TURN = 1.0
+"""Seconds of sampling between two changes of turn: the machine's speed changes more slowly than that."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +101,67 @@ def execute(
     keep_tree: bool = False,
 ) -> Kept:
     """Runs a chooser for the run's time; every sample counted has passed the audit."""
-    settings = settings or SamplerSettings()
-    sampler = Sampler(problem, chooser, run.seed, settings)
-    recorder = Recorder(problem, chooser, run.method, run.seed, settings, sampler.auditor)
-    for event in sampler.events(run.seconds):
-        recorder.listen(event)
+    one = _Competitor(problem, chooser, run, settings or SamplerSettings())
+    one.go_on(math.inf)
+    return one.kept(keep_values, keep_tree)
+
+
+def execute_in_turns(
+    problem: Problem, choosers: Sequence[Any], runs: Sequence[Run], settings: SamplerSettings | None = None
+) -> list[Kept]:
+    """Runs choosers side by side: each goes on for `TURN` seconds of its own time, then it waits for the others.
+
+    Runs one after the other meet a machine whose speed differs by a fifth from one minute to the next; these meet the same one.
+    The batches that are on their way when a turn ends are finished in the next one's: every method gives and takes that alike.
+    """
+    all_ = [_Competitor(problem, c, run, settings or SamplerSettings()) for c, run in zip(choosers, runs, strict=True)]
+    for one in all_:
+        one.begin()
+    while unfinished := [one for one in all_ if not one.finished]:
+        for one in unfinished:
+            one.go_on(TURN)
+    return [one.kept() for one in all_]
+
+
+class _Competitor:
+    """A run whose clock stands still while others have their turn."""
+
+    def __init__(self, problem: Problem, chooser: Any, run: Run, settings: SamplerSettings) -> None:
+        sampler = Sampler(problem, chooser, run.seed, settings)
+        self._chooser = chooser
+        self._recorder = Recorder(problem, chooser, run.method, run.seed, settings, sampler.auditor)
+        self._events = sampler.events(run.seconds, clock=self._clock)
+        self._passed = 0.0  # seconds
+        self._since: float | None = None  # when the turn began
+        self.finished = False
+
+    def _clock(self) -> float:
+        return self._passed + (0.0 if self._since is None else time.perf_counter() - self._since)
+
+    def begin(self) -> None:
+        """Up to the moment when sampling starts."""
+        self._go_on_until(lambda event: isinstance(event, Started))
+
+    def go_on(self, seconds: float) -> None:
+        """For so many seconds, or to the end of the run."""
+        end = self._clock() + seconds
+        self._go_on_until(lambda event: self._clock() >= end)
+
+    def _go_on_until(self, enough: Callable[[Event], bool]) -> None:
+        self._since = time.perf_counter()
+        for event in self._events:
+            self._recorder.listen(event)
+            if enough(event):
+                break
+        else:
+            self.finished = True
+        self._passed, self._since = self._clock(), None
+
+    def kept(self, keep_values: bool = False, keep_tree: bool = False) -> Kept:
+        return _kept(self._recorder, self._chooser, keep_values, keep_tree)
+
+
+def _kept(recorder: Recorder, chooser: Any, keep_values: bool, keep_tree: bool) -> Kept:
     samples = recorder.samples()
     counts = np.bincount(samples.sequence, minlength=len(samples.sequences))
     data = {

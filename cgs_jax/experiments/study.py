@@ -9,10 +9,11 @@ single conditional operators. sweep: price of time and exploration constant.
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path as File
 from typing import Any
@@ -27,6 +28,7 @@ from cgs_jax.experiments.runs import (
     Store,
     Survey,
     execute,
+    execute_in_turns,
     merged_tree,
     operation_name,
     prepare,
@@ -39,6 +41,7 @@ from cgs_jax.record import operator_text, write_json
 from cgs_jax.sampler import SamplerSettings
 from cgs_jax.transitions import Path
 from cgs_jax.uct import Tree
+from cgs_jax.worker import keep
 
 RUN_OVERHEAD = 0.4
 """Seconds that a run takes beyond its sampling time (set-up, tree, files); for the estimate."""
@@ -57,7 +60,7 @@ class Budget:
     seconds: float
     seeds: int
     instances: int | None = None  # None: all
-    expert_seeds: int = 3  # of the experts, which learn nothing and differ little between seeds
+    expert_seeds: int = 2  # of the experts, which learn nothing and differ little between seeds
     rand_seeds: int = 1  # of `rand`, which no claim compares closely
     reference_seconds: float = 4.0
     coverage_least: int = 200  # samples that a method needs for the comparison at equal count
@@ -69,8 +72,9 @@ class Budget:
     survey_seconds_per_operator: float = 0.1
     screened: int = 12
     screen_seconds: float = 1.5
-    top: int = 2
-    top_seeds: int = 1
+    printed_seconds: float = 4.0
+    turns_seconds: float = 15.0  # of tree and the best sequences side by side, until tree has settled
+    turns_seeds: int = 3
     operation_seconds: float = 4.0
 
 
@@ -85,10 +89,13 @@ QUICK = Budget(
     oracle_instances=1,
     screened=8,
     screen_seconds=1.0,
+    printed_seconds=2.0,
+    turns_seconds=2.0,
+    turns_seeds=1,
     operation_seconds=2.0,
 )
 
-FULL = Budget(seconds=15.0, seeds=5)
+FULL = Budget(seconds=10.0, seeds=5)
 
 
 @dataclass(frozen=True)
@@ -200,15 +207,22 @@ class Study:
             for i in range(self.budget.screened)
         ]
 
-    def fixed_runs(self, scene: str) -> list[Run]:
-        # The tree once more, beside them: the machine may be faster or slower than it was in the main runs.
-        labels = ["tree", *(f"screened {i + 1}" for i in range(self.budget.top))]
-        labels += [f"paper {i + 1}" for i in range(len(self._printed(scene).get("found", [])))]
+    def printed_runs(self, scene: str) -> list[Run]:
         return [
-            Run("fixed", scene, instance, label, seed, self.budget.seconds)
-            for seed in range(self.budget.top_seeds)
+            Run("printed", scene, instance, f"paper {i + 1}", 0, self.budget.printed_seconds)
             for instance in self.oracle_instances(scene)
-            for label in labels
+            for i in range(len(self._printed(scene).get("found", [])))
+        ]
+
+    def turns_runs(self, scene: str) -> list[Run]:
+        """Tree, the best expert and, where there is an oracle, the best sequence found by any other means; those of a seed on
+        an instance side by side."""
+        found = self.oracle_instances(scene)
+        return [
+            Run("turns", scene, instance, label, seed, self.budget.turns_seconds)
+            for seed in range(self.budget.turns_seeds)
+            for instance in self.instances(scene)
+            for label in ("tree", "best expert", *(["best found"] if instance in found else []))
         ]
 
     def operation_runs(self, scene: str) -> list[Run]:
@@ -221,7 +235,8 @@ class Study:
             self.reference_runs,
             self.survey_runs,
             self.screen_runs,
-            self.fixed_runs,
+            self.printed_runs,
+            self.turns_runs,
             self.operation_runs,
             self.sweep_runs,
         )
@@ -230,8 +245,10 @@ class Study:
         return [*compared, *(run for kind in stages for scene in self.scenes for run in kind(scene))]
 
     def missing_runs(self) -> list[Run]:
-        """Those that were not run to their end yet."""
-        return [run for run in self.runs() if not self.store.has(run)]
+        """Those that were not run to their end yet, with those that belong beside them."""
+        runs = self.runs()
+        missing = {_side_by_side(run) for run in runs if not self.store.has(run)}
+        return [run for run in runs if _side_by_side(run) in missing]
 
     def _printed(self, scene: str) -> Mapping[str, Any]:
         return self.paper.get(scene, {})
@@ -257,10 +274,15 @@ class Study:
                 yield Progress(f"{scene}: compiling", done, total)
                 self._compile(scene)
                 done += self._compile_estimate(scene)
-        for run in missing:
-            yield Progress(f"{run.scene} {run.instance}: {run.stage} {run.method}, seed {run.seed}", done, total)
-            self._execute(run)
-            done += run.seconds + RUN_OVERHEAD
+        for _, group in itertools.groupby(missing, _side_by_side):
+            runs = list(group)
+            methods = ", ".join(run.method for run in runs)
+            yield Progress(f"{runs[0].scene} {runs[0].instance}: {runs[0].stage} {methods}, seed {runs[0].seed}", done, total)
+            if runs[0].stage == "turns":
+                self._execute_in_turns(runs)
+            else:
+                self._execute(runs[0])
+            done += sum(run.seconds + RUN_OVERHEAD for run in runs)
         yield Progress("done", total, total)
 
     def _compile(self, scene: str) -> None:
@@ -296,13 +318,25 @@ class Study:
             chooser = self._swept(run)
         elif run.stage == "survey":
             chooser = Survey(transitions)
-        elif run.stage in ("screen", "fixed"):
-            chooser = make_chooser(problem, "tree" if run.method == "tree" else self._sequence(run), run.seed)
+        elif run.stage in ("screen", "printed"):
+            chooser = make_chooser(problem, self._sequence(run), run.seed)
         else:
             # Second tries tell conditions that cannot be met from failures of the solver; first tries are counted apart.
             settings = SamplerSettings(tries=2, workers=1)
             chooser = make_chooser(problem, run.method, run.seed)
         self.store.write(run, execute(problem, chooser, run, settings, values, tree))
+
+    def _execute_in_turns(self, runs: Sequence[Run]) -> None:
+        problem = self.problem(runs[0].scene, runs[0].instance)
+        workers = len(runs) * self.settings.workers
+        keep(workers)
+        # Of all the workers: a run alone needs fewer, and only those have read the programs.
+        for _ in prepare(problem, replace(self.settings, workers=workers)):
+            pass
+        methods = ["tree" if run.method == "tree" else self._sequence(run) for run in runs]
+        choosers = [make_chooser(problem, method, run.seed) for method, run in zip(methods, runs, strict=True)]
+        for run, kept in zip(runs, execute_in_turns(problem, choosers, runs, self.settings), strict=True):
+            self.store.write(run, kept)
 
     def _prior(self, run: Run) -> list[Mapping[str, Any]]:
         """Trees of the other instances, same seed."""
@@ -323,16 +357,35 @@ class Study:
         what, number = run.method.split()
         if what == "paper":
             return self._printed(run.scene)["found"][int(number) - 1]
-        if what == "screened":
-            return self.screened(run.scene, run.instance)[int(number) - 1][0]
+        if run.method == "best found":
+            return self._best_found(run.scene, run.instance)
+        if run.method == "best expert":
+            return self.problem(run.scene).scene.task.sequences[self._best_expert(run.scene, run.instance)]
         ranked = self.ranking(run.scene, run.instance)
         return self.problem(run.scene).transitions.format(ranked[min(int(number), len(ranked)) - 1][0])
 
     def screened(self, scene: str, instance: int) -> list[tuple[str, float]]:
         """Screened sequences with their measured rates, best first."""
         runs = [run for run in self.screen_runs(scene) if run.instance == instance]
-        rates = [measures.final_rate(self.store.read(run).elapsed, run.seconds) for run in runs]
+        rates = map(self._final_rate, runs)
         return sorted(zip(map(self._sequence, runs), rates, strict=True), key=lambda entry: -entry[1])
+
+    def _best_found(self, scene: str, instance: int) -> str:
+        """The sequence that did best in the short runs, of the best predicted ones and those that the paper prints."""
+        printed = [run for run in self.printed_runs(scene) if run.instance == instance]
+        tried = [*self.screened(scene, instance), *((self._sequence(run), self._final_rate(run)) for run in printed)]
+        return max(tried, key=lambda entry: entry[1])[0]
+
+    def _best_expert(self, scene: str, instance: int) -> str:
+        """The named sequence of greatest mean final rate in the main runs."""
+        rates: dict[str, list[float]] = {name: [] for name in self.problem(scene).scene.task.sequences}
+        for run in self.main_runs(scene):
+            if run.instance == instance and run.method in rates:
+                rates[run.method].append(self._final_rate(run))
+        return max(rates, key=lambda name: np.mean(rates[name]))
+
+    def _final_rate(self, run: Run) -> float:
+        return measures.final_rate(self.store.read(run).elapsed, run.seconds)
 
     def ranking(self, scene: str, instance: int) -> list[tuple[Path, float]]:
         """Sequences by the rate that the operators' statistics of tree and survey predict."""
@@ -364,8 +417,10 @@ class Study:
             "times": measures.time_grid(self.budget.seconds).tolist(),
             "instances": [self._instance(scene, instance) for instance in self.instances(scene)],
             "sweep": self._sweep(scene),
+            "turns": [self._turns(scene, instance) for instance in self.instances(scene)],
             "oracle": [self._oracle(scene, instance) for instance in self.oracle_instances(scene)],
             "operations": self._operations(scene),
+            "audited": self._audited(scene),
         }
         result["counts"] = self.counts(scene)
         result["variables"] = [variable.name for variable in transitions.graph.variables]
@@ -395,17 +450,13 @@ class Study:
             kept = self.store.read(run, values=True)
             entry = methods.setdefault(
                 run.method,
-                {"final": [], "total": [], "rates": [], "first": [], "startup": [], "rejected": 0,
-                 "max_violation": 0.0, "focus": [], "best": []},
+                {"final": [], "total": [], "rates": [], "first": [], "startup": [], "focus": [], "best": []},
             )
-            meta = kept.data["meta"]
             entry["final"].append(measures.final_rate(kept.elapsed, budget))
             entry["total"].append(len(kept.elapsed))
             entry["rates"].append(measures.rate_over_time(kept.elapsed, times))
             entry["first"].append(float(kept.elapsed.min()) if len(kept.elapsed) else None)
-            entry["startup"].append(meta["startup_seconds"])
-            entry["rejected"] += meta["rejected_by_audit"]
-            entry["max_violation"] = max(entry["max_violation"], kept.data["max_violation"])
+            entry["startup"].append(kept.data["meta"]["startup_seconds"])
             entry["best"].append(kept.data["best_sequences"][:1])
             entry["focus"].append(_focus(problem, kept.data))
             values.setdefault(run.method, []).append(kept.values)
@@ -435,51 +486,61 @@ class Study:
         """Final rates by label and instance."""
         rates: dict[str, dict[str, list[float]]] = {}
         for run in self.sweep_runs(scene):
-            kept = self.store.read(run)
-            by_instance = rates.setdefault(run.method, {})
-            by_instance.setdefault(str(run.instance), []).append(measures.final_rate(kept.elapsed, run.seconds))
+            rates.setdefault(run.method, {}).setdefault(str(run.instance), []).append(self._final_rate(run))
         default = Tree(self.problem(scene).transitions).c_uct
         return {"default_c_uct": default, "rates": rates}
+
+    def _turns(self, scene: str, instance: int) -> dict[str, Any]:
+        """Final rates by seed of what ran side by side, and which sequences those were."""
+        expert = self._best_expert(scene, instance)
+        result: dict[str, Any] = {"instance": instance, "expert": expert, "final": {}, "sequences": {}}
+        for run in self.turns_runs(scene):
+            if run.instance == instance:
+                result["final"].setdefault(run.method, []).append(self._final_rate(run))
+                if run.method != "tree":
+                    result["sequences"][run.method] = self._sequence(run)
+        return result
 
     def _oracle(self, scene: str, instance: int) -> dict[str, Any]:
         transitions = self.problem(scene, instance).transitions
         ranked = self.ranking(scene, instance)
         predicted = {signature(path): rate for path, rate in ranked}
-        measured: dict[str, dict[str, Any]] = {}
+
+        def tried(text: str, rate: float) -> dict[str, Any]:
+            return {"sequence": text, "predicted": predicted.get(signature(transitions.parse(text))), "rate": rate}
+
         named = self.problem(scene).scene.task.sequences
-        runs = [run for run in [*self.fixed_runs(scene), *self.main_runs(scene)] if run.instance == instance]
-        trees: dict[str, list[float]] = {}
-        for run in runs:
-            if run.method == "tree":
-                trees.setdefault(run.stage, []).append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
-        for run in runs:
-            if run.method == "tree" or run.stage == "main" and run.method not in named:
-                continue
-            text = named.get(run.method) or self._sequence(run)
-            entry = measured.setdefault(
-                run.method,
-                {
-                    "sequence": text,
-                    "predicted": predicted.get(signature(transitions.parse(text))),
-                    "final": [],
-                    "tree": trees[run.stage],  # beside it
-                },
-            )
-            entry["final"].append(measures.final_rate(self.store.read(run).elapsed, run.seconds))
-        rates = [rate for _, rate in ranked]
-        screened = [
-            {"sequence": text, "predicted": predicted.get(signature(transitions.parse(text))), "rate": rate}
-            for text, rate in self.screened(scene, instance)
-        ]
+        main = [run for run in self.main_runs(scene) if run.instance == instance and run.method in named]
+        experts: dict[str, list[float]] = {}
+        for run in main:
+            experts.setdefault(run.method, []).append(self._final_rate(run))
+        turns = self._turns(scene, instance)
         return {
-            "screened": screened,
             "instance": instance,
             "sequences": transitions.count_sequences(),
             "distinct": len(ranked),
-            "predicted": [round(rate, 3) for rate in rates],
+            "predicted": [round(rate, 3) for _, rate in ranked],
             "best_predicted": [[transitions.format(path), rate] for path, rate in ranked[:5]],
-            "measured": measured,
+            "screened": [tried(text, rate) for text, rate in self.screened(scene, instance)],
+            "printed": [
+                tried(self._sequence(run), self._final_rate(run))
+                for run in self.printed_runs(scene)
+                if run.instance == instance
+            ],
+            "experts": [tried(named[name], float(np.mean(rates))) for name, rates in experts.items()],
+            "found": tried(turns["sequences"]["best found"], float(np.mean(turns["final"]["best found"]))),
         }
+
+    def _audited(self, scene: str) -> dict[str, Any]:
+        """What the audit said of the samples of all runs."""
+        total = {"samples": 0, "rejected": 0, "max_violation": 0.0}
+        for run in self.runs():
+            if run.scene == scene:
+                kept = self.store.read(run)
+                total["samples"] += len(kept.elapsed)
+                total["rejected"] += kept.data["meta"]["rejected_by_audit"]
+                total["max_violation"] = max(total["max_violation"], kept.data["max_violation"])
+        return total
 
     def _operations(self, scene: str) -> list[dict[str, Any]]:
         transitions = self.problem(scene).transitions
@@ -522,3 +583,8 @@ def _focus(problem: Problem, data: Mapping[str, Any]) -> float | None:
     names = {operator_text(transition) for transition in problem.transitions.parse(best[0][0])}
     spent = sum(operator["device_seconds"] for name, operator in data["operators"].items() if name in names)
     return spent / total
+
+
+def _side_by_side(run: Run) -> Run:
+    """The same for all runs that take turns."""
+    return replace(run, method="") if run.stage == "turns" else run
