@@ -79,6 +79,9 @@ PROMISE = 1.1
 EARLIER_PROMISE = 1.2
 """The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
 
+FIRST_PROMISE = 2.0
+"""The same until `KEEN_AFTER`: what other instances promise often does not hold, and it takes half a second each to tell."""
+
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
@@ -243,7 +246,7 @@ class Tree(Records):
         more = CLEARLY_MORE if exploring else PROMISE
         # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
-            more = EARLIER_PROMISE
+            more = EARLIER_PROMISE if self._total.spent >= KEEN_AFTER else FIRST_PROMISE
         if self._states is not None and self._advantage <= more:
             return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.

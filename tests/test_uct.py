@@ -488,6 +488,34 @@ def test_a_warm_start_begins_with_what_did_well_on_most_instances():
     assert warm.incumbent == common
 
 
+@pytest.mark.parametrize(("promised", "left_at_once"), [(40, False), (60, True)])
+def test_a_warm_start_leaves_what_is_proven_at_first_for_twice_as_much_only(promised, left_at_once):
+    """a then b: 25 samples/s on three instances and here. (a,b): 40 or 60 on the one where it was run, and none here."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    earlier = []
+    for instance in range(3):
+        tree = Tree(transitions)
+        for _ in range(200):
+            tree.record((), common[0], 100, 50, 1.0)
+            tree.record(common[:1], common[1], 50, 50, 1.0)
+            if instance == 2:
+                tree.record((), rare[0], 100, promised, 1.0)
+        earlier.append(tree.as_json())
+    warm = Tree(transitions)
+    warm.warm_start(earlier, n_equiv=5)
+    chosen = []
+    for _ in range(200):
+        chosen.append(warm.select())
+        if chosen[-1] == common:
+            warm.record((), common[0], 100, 50, 1.0, spent=0.02)
+            warm.record(common[:1], common[1], 50, 50, 1.0, spent=0.02)
+        else:
+            warm.record((), chosen[-1][0], 100, 0, 1.0, spent=0.02)
+    assert (rare in chosen[:90]) == left_at_once
+    assert rare in chosen
+
+
 def test_a_warm_start_keeps_how_further_tries_fall_off_where_instances_differ():
     transitions = pair_graph()
     (step,) = transitions.parse("(a,b)")
