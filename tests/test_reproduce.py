@@ -56,6 +56,11 @@ def test_ratio_with_nothing_below_is_no_ratio():
     assert ratio["ratio"] == pytest.approx(3.0) and ratio["low"] < 3.0 < ratio["high"]
 
 
+def test_what_both_gain_on_a_quick_machine_does_not_widen_the_interval_of_their_ratio():
+    ratio = measures.ratio_with_interval([1.0, 2.0, 4.2], [1.0, 2.0, 4.0])
+    assert ratio["ratio"] == pytest.approx(7.2 / 7.0) and 1.0 <= ratio["low"] and ratio["high"] <= 1.05
+
+
 def test_half_the_space_is_half_the_coverage():
     random = np.random.default_rng(0)
 

@@ -65,13 +65,17 @@ def side_by_side(ours: Sequence[float], theirs: Sequence[float]) -> tuple[Sequen
 
 
 def ratio_with_interval(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, float | None]:
-    """Mean over mean with a bootstrap interval over seeds; all None where theirs is 0 (nothing to compare with)."""
+    """Mean over mean of runs side by side, with a bootstrap interval over seeds; all None where theirs is 0.
+
+    The seeds of both are resampled together, since these met the same machine.
+    """
     above, below = np.asarray(ours, float), np.asarray(theirs, float)
     if not below.mean() > 0:
         return {"ratio": None, "low": None, "high": None}
     ratio = float(above.mean() / below.mean())
     # A resample of what they did can be all zeros.
-    low, high = bootstrap_interval(above, below, statistic=ratio_of_means) if (below > 0).all() else (ratio, ratio)
+    known = (below > 0).all()
+    low, high = bootstrap_interval(above, below, statistic=ratio_of_means, paired=True) if known else (ratio, ratio)
     return {"ratio": ratio, "low": low, "high": high}
 
 
