@@ -47,3 +47,8 @@ def run(problem, chooser, run, settings=None, keep_values=False, keep_tree=False
             value[:, 3:] /= np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
         values[variable.name] = value
     return runs.Kept(data, elapsed, values)
+
+
+def run_in_turns(problem, choosers, runs, settings=None, scale=1.0):
+    """Runs side by side that were never made."""
+    return [run(problem, chooser, one, settings, scale=scale) for chooser, one in zip(choosers, runs, strict=True)]

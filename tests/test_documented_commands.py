@@ -160,7 +160,9 @@ def benchmark(arguments, monkeypatch):
 def reproduce(arguments, monkeypatch):
     """`scripts/reproduce.py` with made-up runs, in a folder of its own."""
     monkeypatch.setattr(study, "execute", functools.partial(made_up.run, scale=0.2))
+    monkeypatch.setattr(study, "execute_in_turns", functools.partial(made_up.run_in_turns, scale=0.2))
     monkeypatch.setattr(study, "prepare", lambda problem, settings: iter(()))
+    monkeypatch.setattr(study, "keep", lambda count: None)
     return load_script("scripts/reproduce.py").main([*arguments, *MADE_UP_STUDY, "--out", mkdtemp(dir=".")])
 
 

@@ -184,6 +184,7 @@ def finished(tmp_path_factory):
         patch.setattr(study, "execute", record)
         patch.setattr(study, "execute_in_turns", record_in_turns)
         patch.setattr(study, "prepare", lambda problem, settings: iter(()))
+        patch.setattr(study, "keep", lambda count: None)
         whole = Study(tmp_path_factory.mktemp("study"), ["handover"], BUDGET, PAPER)
         progress = list(whole.execute())
         yield whole, made, progress
