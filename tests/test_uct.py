@@ -469,10 +469,9 @@ def test_a_warm_start_explores_after_the_first_samples():
     assert set(chosen[:100]) == {best} and set(chosen[100:]) > {best}
 
 
-def test_a_warm_start_begins_with_what_did_well_on_most_instances():
-    """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average."""
+def warm_from_three(common, rare, successes):
+    """Starts from three instances: the common sequence makes 25 samples/s on all, the rare one ran on one of them."""
     transitions = pair_graph()
-    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
     earlier = []
     for instance in range(3):
         tree = Tree(transitions)
@@ -480,10 +479,18 @@ def test_a_warm_start_begins_with_what_did_well_on_most_instances():
             tree.record((), common[0], 100, 50, 1.0)
             tree.record(common[:1], common[1], 50, 50, 1.0)
             if instance == 2:
-                tree.record((), rare[0], 100, 50, 1.0)
+                tree.record((), rare[0], 100, successes, 1.0)
         earlier.append(tree.as_json())
     warm = Tree(transitions)
     warm.warm_start(earlier, n_equiv=5)
+    return warm
+
+
+def test_a_warm_start_begins_with_what_did_well_on_most_instances():
+    """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    warm = warm_from_three(common, rare, 50)
     warm.select()
     assert warm.incumbent == common
 
@@ -493,17 +500,7 @@ def test_a_warm_start_leaves_what_is_proven_at_first_for_twice_as_much_only(prom
     """a then b: 25 samples/s on three instances and here. (a,b): 40 or 60 on the one where it was run, and none here."""
     transitions = pair_graph()
     common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
-    earlier = []
-    for instance in range(3):
-        tree = Tree(transitions)
-        for _ in range(200):
-            tree.record((), common[0], 100, 50, 1.0)
-            tree.record(common[:1], common[1], 50, 50, 1.0)
-            if instance == 2:
-                tree.record((), rare[0], 100, promised, 1.0)
-        earlier.append(tree.as_json())
-    warm = Tree(transitions)
-    warm.warm_start(earlier, n_equiv=5)
+    warm = warm_from_three(common, rare, promised)
     chosen = []
     for _ in range(200):
         chosen.append(warm.select())
