@@ -185,6 +185,10 @@ LOOKS = 8
 EXPLORED = 2
 """Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much."""
 
+PARTS_OF_KNOWN = 3
+"""Batches of the sequence that is run whatever comes out of it grow by so many of these parts: until something has come through
+all steps there is no sample, and full batches take long for that."""
+
 PATIENCE = 4
 """Batches that may be spent until the step after one that was looked at for the first time is looked at too."""
 
@@ -224,8 +228,8 @@ AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
 AUDIT_BATCHES = 16
-"""Batches after which full samples are audited, however few there are. In the beginning as soon as as many wait as were found:
-whoever watches, or stops at a number of samples, should not wait for the first ones."""
+"""Batches after which full samples are audited, however few there are. In the beginning as soon as half as many wait as were
+found: whoever watches, or stops at a number of samples, should not wait for the first ones."""
 
 TRIES = 0
 """Name under which the number of earlier tries travels with a waiting condition (no variable can be called that)."""
@@ -785,8 +789,11 @@ class Sampler:
             young = visits < 2
             most = self._pace.affordable(step.operator)
             explored = known and path != getattr(self.chooser, "promised", ())
-            grown = min(visits + 1, EXPLORED if explored else LOOKS)
-            if grown < LOOKS and path != known:
+            if path == known:
+                grown = PARTS_OF_KNOWN * (visits + 1)
+            else:
+                grown = min(visits + 1, EXPLORED if explored else LOOKS)
+            if grown < LOOKS:
                 most = max(most * grown // LOOKS, min(self.settings.lanes, batch))
             # A first look takes what there is: while it waits for more, the search may turn to something else for good.
             enough = max(most // 2, 1) if visits else min(FIRST_LOOK, max(most // 8, 1))
@@ -920,7 +927,9 @@ class Sampler:
         if not self._candidates:
             return False
         waiting = sum(candidates.size for candidates in self._candidates)
-        many = min(AUDIT_SAMPLES, found) if wanted is None else min(AUDIT_SAMPLES, found, wanted - found)
+        many = min(AUDIT_SAMPLES, found // 2)
+        if wanted is not None:
+            many = min(many, wanted - found)
         return waiting >= many or self._batches_waited >= AUDIT_BATCHES
 
     def take_candidates(self) -> list[Candidates]:
