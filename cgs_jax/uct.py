@@ -82,6 +82,10 @@ EARLIER_PROMISE = 1.2
 FIRST_PROMISE = 2.0
 """The same until `KEEN_AFTER`: what other instances promise often does not hold, and it takes half a second each to tell."""
 
+UNLIKE = 0.5
+"""But where the incumbent makes less than this share of what it made of the earlier instances on average, this instance is
+unlike them, and `EARLIER_PROMISE` holds from the beginning."""
+
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
 
@@ -176,6 +180,7 @@ class Tree(Records):
         self._untried_at = -1  # epoch
         self._untried: tuple[float, Path] = (-math.inf, ())
         self._earlier_batches = 0.0  # of an earlier instance
+        self._expected = 0.0  # rate of what was proven on earlier instances, samples per second
         self._incumbent: Path = ()
         self._promised: Path = ()
         self._believed: Path = ()  # would be better than the incumbent if its first looks told the truth
@@ -246,7 +251,8 @@ class Tree(Records):
         more = CLEARLY_MORE if exploring else PROMISE
         # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
-            more = EARLIER_PROMISE if self._total.spent >= KEEN_AFTER else FIRST_PROMISE
+            as_expected = self._rate_now(incumbent) >= UNLIKE * self._expected
+            more = FIRST_PROMISE if self._total.spent < KEEN_AFTER and as_expected else EARLIER_PROMISE
         if self._states is not None and self._advantage <= more:
             return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
@@ -674,6 +680,8 @@ class Tree(Records):
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
         self._earlier_batches = sum(data["totals"].get("batches", 0.0) for data in earlier) / max(len(earlier), 1)
+        if self._proven:
+            self._expected = self._rate_of(self._proven)
         self._stale = True
 
     @classmethod

@@ -513,6 +513,22 @@ def test_a_warm_start_leaves_what_is_proven_at_first_for_twice_as_much_only(prom
     assert rare in chosen
 
 
+def test_a_warm_start_leaves_what_is_proven_sooner_where_that_makes_much_less_than_elsewhere():
+    """a then b: 25 samples/s on three instances, 8 here. (a,b): 12 on the one where it was run, which is less than twice 8."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    warm = warm_from_three(common, rare, 12)
+    chosen = []
+    for _ in range(60):
+        chosen.append(warm.select())
+        if chosen[-1] == common:
+            warm.record((), common[0], 100, 50, 1.0, spent=0.02)
+            warm.record(common[:1], common[1], 50, 16, 1.0, spent=0.02)
+        else:
+            warm.record((), chosen[-1][0], 100, 12, 1.0, spent=0.02)
+    assert chosen[0] == common and rare in chosen
+
+
 def test_a_warm_start_keeps_how_further_tries_fall_off_where_instances_differ():
     transitions = pair_graph()
     (step,) = transitions.parse("(a,b)")
