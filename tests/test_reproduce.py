@@ -194,7 +194,7 @@ def test_study_makes_every_run_once_and_goes_on_where_it_stopped(finished):
     whole, made, progress = finished
     assert made == whole.runs() and len(set(made)) == len(made)
     assert progress[-1].done == progress[-1].total and [p.done for p in progress] == sorted(p.done for p in progress)
-    lost = next(run for run in made if run.stage == "sweep")
+    lost = next(run for run in made if run.stage == "screen")
     (whole.store.folder / f"{lost.key}.json").unlink()
     count = len(made)
     list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
@@ -211,6 +211,16 @@ def test_what_ran_side_by_side_is_run_again_together(finished):
     list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
     assert [(run.method, run.seed) for run in made[count:]] == [("tree", 1), ("best expert", 1), ("best found", 1)]
     assert {(run.instance, run.seconds) for run in made[count:]} == {(0, 1.0)}
+    del made[count:]
+
+
+def test_settings_of_a_sweep_run_side_by_side_on_every_instance(finished):
+    whole, made, _ = finished
+    swept = [run for run in made if run.stage == "sweep"]
+    (whole.store.folder / f"{swept[0].key}.json").unlink()
+    count = len(made)
+    list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
+    assert made[count:] == swept
     del made[count:]
 
 

@@ -319,7 +319,9 @@ def _sweep(scene: Mapping[str, Any]) -> str:
         ]
         for label in rates
     ]
-    return table(["Setting", *(f"instance {i}" for i in instances)], rows)
+    budget = scene["budget"]
+    how = f"Side by side, {budget['seconds']:g} s each, mean over seeds ({budget['sweep_seeds']}), samples/s:\n\n"
+    return how + table(["Setting", *(f"instance {i}" for i in instances)], rows)
 
 
 def _oracle(scene: Mapping[str, Any]) -> str:

@@ -3,8 +3,9 @@
 Stages, in order, each for all scenes before the next. compile: all programs. main: tree, the experts, rand. warm: tree
 with the statistics of the other instances; seed by seed beside main, so that an early look sees every scene. reference:
 held-out samples for coverage. survey: every operator. screen: the sequences that the operators' statistics predict to be
-best, shortly. fixed: those that were best there, and those that the paper found, as long as the main runs. operations:
-single conditional operators. sweep: price of time and exploration constant.
+best, shortly. printed: those that the paper found. turns: tree, the best expert and the best sequence found. operations:
+single conditional operators. sweep: price of time and exploration constant. What is compared in turns and sweep runs side by
+side.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from cgs_jax.problems import Problem, load_problem
 from cgs_jax.record import operator_text, write_json
 from cgs_jax.sampler import SamplerSettings
 from cgs_jax.transitions import Path
-from cgs_jax.uct import Tree
+from cgs_jax.uct import Chooser, Tree
 from cgs_jax.worker import keep
 
 RUN_OVERHEAD = 0.4
@@ -48,6 +49,9 @@ RUN_OVERHEAD = 0.4
 
 COMPILE_PER_OPERATOR = 0.5
 """Seconds to make a scene ready on two cores, per conditional problem (they share programs); for the estimate."""
+
+SIDE_BY_SIDE = "turns", "sweep"
+"""Stages whose runs of a seed on an instance take turns."""
 
 HELD_OUT = 1000
 """Seed of the runs that make the reference set; no other run has it."""
@@ -65,9 +69,9 @@ class Budget:
     reference_seconds: float = 4.0
     coverage_least: int = 200  # samples that a method needs for the comparison at equal count
     sweep_instances: int = 2
-    sweep_seeds: int = 1
+    sweep_seeds: int = 2
     prices: tuple[float, ...] = (0.1, 1.0, 10.0)
-    exploration: tuple[float, ...] = (0.01, 0.03, 0.15, 0.5)
+    exploration: tuple[float, ...] = (0.02, 0.1, 0.5)
     oracle_instances: int | None = None
     survey_seconds_per_operator: float = 0.1
     screened: int = 12
@@ -85,7 +89,8 @@ QUICK = Budget(
     reference_seconds=2.0,
     coverage_least=50,
     sweep_instances=1,
-    exploration=(0.003, 0.3),
+    sweep_seeds=1,
+    exploration=(0.02, 0.5),
     oracle_instances=1,
     screened=8,
     screen_seconds=1.0,
@@ -278,7 +283,7 @@ class Study:
             runs = list(group)
             methods = ", ".join(run.method for run in runs)
             yield Progress(f"{runs[0].scene} {runs[0].instance}: {runs[0].stage} {methods}, seed {runs[0].seed}", done, total)
-            if runs[0].stage == "turns":
+            if runs[0].stage in SIDE_BY_SIDE:
                 self._execute_in_turns(runs)
             else:
                 self._execute(runs[0])
@@ -314,8 +319,6 @@ class Study:
             chooser = make_chooser(problem, run.method, run.seed)
         elif run.stage == "warm":
             chooser = make_chooser(problem, run.method, run.seed, self._prior(run))
-        elif run.stage == "sweep":
-            chooser = self._swept(run)
         elif run.stage == "survey":
             chooser = Survey(transitions)
         elif run.stage in ("screen", "printed"):
@@ -333,10 +336,15 @@ class Study:
         # Of all the workers: a run alone needs fewer, and only those have read the programs.
         for _ in prepare(problem, replace(self.settings, workers=workers)):
             pass
-        methods = ["tree" if run.method == "tree" else self._sequence(run) for run in runs]
-        choosers = [make_chooser(problem, method, run.seed) for method, run in zip(methods, runs, strict=True)]
+        choosers = [self._competitor(run) for run in runs]
         for run, kept in zip(runs, execute_in_turns(problem, choosers, runs, self.settings), strict=True):
             self.store.write(run, kept)
+
+    def _competitor(self, run: Run) -> Chooser:
+        if run.stage == "sweep":
+            return self._swept(run)
+        method = "tree" if run.method == "tree" else self._sequence(run)
+        return make_chooser(self.problem(run.scene, run.instance), method, run.seed)
 
     def _prior(self, run: Run) -> list[Mapping[str, Any]]:
         """Trees of the other instances, same seed."""
@@ -344,7 +352,7 @@ class Study:
         runs = [Run("main", run.scene, i, "tree", run.seed, run.seconds) for i in others]
         return [self.store.read(other).data["tree"] for other in runs]
 
-    def _swept(self, run: Run) -> Any:
+    def _swept(self, run: Run) -> Chooser:
         transitions = self.problem(run.scene, run.instance).transitions
         what, _, number = run.method.partition("=")
         if what == "rollout":
@@ -587,4 +595,4 @@ def _focus(problem: Problem, data: Mapping[str, Any]) -> float | None:
 
 def _side_by_side(run: Run) -> Run:
     """The same for all runs that take turns."""
-    return replace(run, method="") if run.stage == "turns" else run
+    return replace(run, method="") if run.stage in SIDE_BY_SIDE else run
