@@ -310,6 +310,24 @@ def test_claims_are_confronted_with_the_numbers(finished):
     assert claim("passed the audit").passed is False
 
 
+@pytest.mark.parametrize(("elsewhere", "holds"), [(150, True), (170, False)])
+def test_coverage_is_judged_for_each_scene_and_for_all_together(finished, elsewhere, holds):
+    """Of tree's 100 cells of every variable an expert has 40 in one scene, 150 or 170 in the other: 95 or 105 on average."""
+    one = json.loads(json.dumps(finished[0].numbers("handover")))
+    other = json.loads(json.dumps(one)) | {"scene": "banana"}
+    for scene, cells in ((one, 40), (other, elsewhere)):
+        for instance in scene["instances"]:
+            for variable in instance["coverage"]["variables"].values():
+                for method, entry in variable["methods"].items():
+                    count = 100 if method == "tree" else cells
+                    entry["cells_at_equal_time"] = [count for _ in entry["cells_at_equal_time"]]
+    found = claims.confront({"scenes": {"handover": one, "banana": other}, "counts": {}})
+    held = {claim.text.split(":")[0]: claim.passed for claim in found if "at least every expert's" in claim.text}
+    assert held == {"handover": True, "banana": False, "all scenes": holds}
+    alone = claims.confront({"scenes": {"handover": one}, "counts": {}})
+    assert not any("all scenes" in claim.text for claim in alone)
+
+
 def test_an_operation_out_of_order_is_named_with_what_its_conditions_allow(finished):
     scene = finished[0].numbers("handover")
     operations = [entry for entry in scene["operations"] if entry["measured_microseconds"]]
