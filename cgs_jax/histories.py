@@ -210,7 +210,8 @@ class PooledOperator:
     """Pooled statistics of one conditional problem, and what they predict."""
 
     __slots__ = (
-        "guess", "hazards", "hopeful", "loops", "per_loop", "ready", "seconds_per_try", "statistics", "trust", "within",
+        "guess", "hazards", "hopeful", "hopeful_within", "loops", "per_loop", "ready", "seconds_per_try", "statistics",
+        "trust", "within",
     )  # fmt: skip
 
     def __init__(self, loops: int, per_loop: float, guess: float, outlook: Outlook) -> None:
@@ -228,6 +229,7 @@ class PooledOperator:
         # The guessed cost counts only until a cost was seen: it may be wrong by orders of magnitude.
         self.seconds_per_try = known.seconds / known.tries if known.tries else outlook.slowness * self.guess
         self.within = _within(self.hazards)
+        self.hopeful_within = _within(_hopeful(self.hazards, self.trust))
         # After a history that was never tried: it may do as well as was guessed, whatever others did.
         self.hopeful = _within([max(h, prior) for h in _hopeful(self.hazards, self.trust)])
 
@@ -286,6 +288,9 @@ class History:
 
     def predict(self) -> None:
         operator, own = self.operator, self.statistics
+        if not own.attempts and not self.lean:
+            self._predict_as_operator()
+            return
         expected, trust = operator.hazards, operator.trust
         if self.lean:
             expected = [min(h * self.lean[min(k, len(self.lean) - 1)], 1.0) for k, h in enumerate(expected)]
@@ -313,6 +318,25 @@ class History:
             self.believed_cost = min((read_cost + tries * per_try) / max(success, 1e-12) for success, tries in within)
         self.hopeful_success, tries = _within(_hopeful(hazards, known))[self.tries - 1]
         if own.tries + self.borrowed.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
+            self.hopeful_success, tries = operator.hopeful[self.tries - 1]
+        self.hopeful_cost = tries * per_try
+
+    def _predict_as_operator(self) -> None:
+        """Where nothing is known of the history itself: what is expected of its operator, which most histories share."""
+        operator = self.operator
+        per_try, within = operator.seconds_per_try, operator.within
+        read_cost = sum(read.item_cost for read in self.reads)
+        self.item_cost = math.inf
+        for k, (success, tries) in enumerate(within, start=1):
+            item_cost = (read_cost + tries * per_try) / max(success, 1e-12)
+            if item_cost < self.item_cost:
+                self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
+        self.believed_cost = self.item_cost
+        believed = sum(read.believed_cost for read in self.reads)
+        if believed != read_cost:
+            self.believed_cost = operator.seconds_per_item(believed)
+        self.hopeful_success, tries = operator.hopeful_within[self.tries - 1]
+        if self.borrowed.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
             self.hopeful_success, tries = operator.hopeful[self.tries - 1]
         self.hopeful_cost = tries * per_try
 
@@ -371,6 +395,7 @@ class Records:
         self._operators: dict[Problem, PooledOperator] = {}
         self._steps: dict[State, dict[tuple[str, ...], Step]] = {}
         self._histories: dict[tuple, History] = {}
+        self._remembered: dict[tuple[Step, tuple[History, ...]], tuple[History, tuple[History, ...]]] = {}
         self._known: list[History] = []  # with statistics of their own
         self._nodes: dict[frozenset[History], Node] = {}
         self._outlook = Outlook()
@@ -523,25 +548,32 @@ class Records:
 
         only_made: whether all their histories must have been made, here or on earlier instances.
         """
-        # Cost, components, and the last transition with the label before it.
-        partial: dict[State, list[tuple[float, tuple[History, ...], Any]]] = {state: [] for state in self._states}
-        partial[frozenset()] = [(0.0, (), None)]
+        # Cost, components, and the last transition with the label before it. Sequences that differ only in the order of
+        # independent steps end with the same components: of these the first of the cheapest.
+        partial: dict[State, dict[frozenset[History], tuple[float, tuple[History, ...], Any]]]
+        partial = {state: {} for state in self._states}
+        partial[frozenset()] = {frozenset(): (0.0, (), None)}
+        best: dict[State, list[tuple[float, tuple[History, ...], Any]]] = {}
+        version = self._version
         for state in self._states:
-            # Sequences that differ only in the order of independent steps end with the same components.
-            distinct: dict[frozenset[History], tuple[float, tuple[History, ...], Any]] = {}
-            for label in sorted(partial[state], key=itemgetter(0)):
-                distinct.setdefault(frozenset(label[1]), label)
-            labels = partial[state] = list(distinct.values())[:k]
+            labels = best[state] = sorted(partial.pop(state).values(), key=itemgetter(0))[:k]
             for step in self._steps_from(state).values():
                 if not among(step):
                     continue
                 others = partial[step.target]
                 for label in labels:
-                    history, kept = self._made_by(step, label[1])
+                    history, kept = self._made_again(step, label[1])
                     if only_made and not history.prefixes:
                         continue
-                    cost = cost_of(self._predicted(history)) + sum(map(cost_of, kept))
-                    others.append((cost, (*kept, history), (step.transition, label)))
+                    if history.version != version:
+                        self._predicted(history)
+                    cost = cost_of(history)
+                    for component in kept:
+                        cost += cost_of(component)
+                    components = (*kept, history)
+                    known = others.get(same := frozenset(components))
+                    if known is None or cost < known[0]:
+                        others[same] = (cost, components, (step.transition, label))
 
         def path_to(label: Any) -> Path:
             path: list[Transition] = []
@@ -550,7 +582,7 @@ class Records:
                 path.append(transition)
             return tuple(reversed(path))
 
-        return {state: [path_to(label) for label in labels] for state, labels in partial.items()}
+        return {state: [path_to(label) for label in labels] for state, labels in best.items()}
 
     def _predict_operators(self) -> None:
         """Renew what operators predict; histories follow when they are asked."""
@@ -649,6 +681,13 @@ class Records:
             available = ", ".join(str(step.transition) for step in steps.values()) or "nothing"
             raise InputError(f"{transition} is no kept transition at its state; available: {available}")
         return steps[transition.new]
+
+    def _made_again(self, step: Step, components: tuple[History, ...]) -> tuple[History, tuple[History, ...]]:
+        """Like `_made_by`, remembered: for what is asked at every refresh."""
+        made = self._remembered.get((step, components))
+        if made is None:
+            made = self._remembered[step, components] = self._made_by(step, components)
+        return made
 
     def _made_by(self, step: Step, components: tuple[History, ...]) -> tuple[History, tuple[History, ...]]:
         """The history that a step makes out of components, and those that it leaves alone."""
