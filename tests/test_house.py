@@ -60,7 +60,7 @@ MAY_IMPORT = {
         "audit", "augmented_lagrangian", "keyframes", "operators", "own", "problems", "programs", "scene", "tables",
         "transitions",
     },
-    "worker": {"errors", "audit", "batches", "cache", "operators", "problems", "programs", "scene", "transitions"},
+    "worker": {"errors", "audit", "batches", "cache", "operators", "problems", "programs", "transitions"},
     "sampler": {
         "errors", "audit", "augmented_lagrangian", "batches", "cache", "keyframes", "operators", "problems", "programs",
         "scene", "transitions", "uct", "worker",
