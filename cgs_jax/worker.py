@@ -25,13 +25,9 @@ from cgs_jax.audit import Tolerances
 from cgs_jax.batches import AimedTables, Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
-from cgs_jax.problems import Problem, build_problem
+from cgs_jax.problems import load_problem
 from cgs_jax.programs import Program, load_portable
-from cgs_jax.scene import load_scene
 from cgs_jax.transitions import Transition
-
-MOST_PROBLEMS = 32
-"""Problems that a worker keeps: runs on the same one, or on the instances of a scene in turn, need not wait for it."""
 
 ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of a process whose programs run on one thread."""
@@ -249,7 +245,6 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         )
         return
     loaded: dict[int, Program | None] = {}
-    problems: dict[bytes, Problem] = {}
     while True:
         try:
             message: Setup | Aim | Audit | Install | Batch = pickle.load(source)
@@ -259,7 +254,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             if isinstance(message, Setup):
                 if message.cache_folder is not None:
                     cache.enable_disk_cache(message.cache_folder)
-                problem = _problem(message, problems)
+                problem = load_problem(message.scene, message.instance)
                 runner = BatchRunner(problem, message.seed, message.settings, message.tolerances)
                 answer("ready")
             elif isinstance(message, Install):
@@ -276,17 +271,6 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
                 answer(runner.run(message))
         except Exception as error:  # noqa: BLE001 - sent to the process that asked
             answer(error)
-
-
-def _problem(setup: Setup, known: dict[bytes, Problem]) -> Problem:
-    """A problem that is known by what its files say now, or a new one, known from now on."""
-    scene = load_scene(setup.scene, setup.instance)
-    made_of = pickle.dumps((scene.task, scene.xml))
-    if made_of not in known:
-        if len(known) >= MOST_PROBLEMS:
-            known.pop(next(iter(known)))
-        known[made_of] = build_problem(scene)
-    return known[made_of]
 
 
 def _loaded(data: bytes) -> Program | None:

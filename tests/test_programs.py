@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import pickle
-import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +19,6 @@ from cgs_jax.batches import Batch, BatchRunner, BatchSettings
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
 from cgs_jax.sampler import SamplerSettings
-from cgs_jax.scene import scenes_folder
 
 SETTINGS = SamplerSettings()
 SMALL = BatchSettings(64, 32, SETTINGS.solver)
@@ -153,18 +151,6 @@ def test_a_refusal_ends_the_run(monkeypatch):
     monkeypatch.setattr(cache, "SOURCES", "another digest")
     with pytest.raises(InputError, match="other sources"):
         cgs_jax.sample(at, time_budget=30.0, method="expert3")
-
-
-def test_a_worker_keeps_its_problems_until_their_files_change(tmp_path):
-    place = shutil.copytree(scenes_folder() / "pick_place", tmp_path / "pick_place")
-    setups = [worker.Setup(str(place / "pick_place.toml"), instance, 0, SMALL, None, None) for instance in (0, 1)]
-    known = {}
-    first, other, again = (worker._problem(setups[k], known) for k in (0, 1, 0))
-    assert again is first and other is not first
-    model = place / "pick_place.xml"
-    model.write_text(model.read_text().replace("<worldbody>", "<worldbody><site name='new'/>"))
-    changed = worker._problem(setups[0], known)
-    assert changed is not first and changed.scene.model.nsite == first.scene.model.nsite + 1
 
 
 def test_a_worker_compiles_what_it_cannot_load():
