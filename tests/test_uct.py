@@ -486,6 +486,19 @@ def warm_from_three(common, rare, successes):
     return warm
 
 
+def choices(warm, common, count, successes, elsewhere):
+    """What is chosen where the second step of the common sequence succeeds so often in 50 tries, all else in 100."""
+    chosen = []
+    for _ in range(count):
+        chosen.append(warm.select())
+        if chosen[-1] == common:
+            warm.record((), common[0], 100, 50, 1.0, spent=0.02)
+            warm.record(common[:1], common[1], 50, successes, 1.0, spent=0.02)
+        else:
+            warm.record((), chosen[-1][0], 100, elsewhere, 1.0, spent=0.02)
+    return chosen
+
+
 def test_a_warm_start_begins_with_what_did_well_on_most_instances():
     """a then b: 25 samples/s on three instances. (a,b): 50 on the only one where it was run, and so by the average."""
     transitions = pair_graph()
@@ -501,14 +514,7 @@ def test_a_warm_start_leaves_what_is_proven_at_first_for_twice_as_much_only(prom
     transitions = pair_graph()
     common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
     warm = warm_from_three(common, rare, promised)
-    chosen = []
-    for _ in range(200):
-        chosen.append(warm.select())
-        if chosen[-1] == common:
-            warm.record((), common[0], 100, 50, 1.0, spent=0.02)
-            warm.record(common[:1], common[1], 50, 50, 1.0, spent=0.02)
-        else:
-            warm.record((), chosen[-1][0], 100, 0, 1.0, spent=0.02)
+    chosen = choices(warm, common, 200, 50, 0)
     assert (rare in chosen[:90]) == left_at_once
     assert rare in chosen
 
@@ -518,14 +524,7 @@ def test_a_warm_start_leaves_what_is_proven_sooner_where_that_makes_much_less_th
     transitions = pair_graph()
     common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
     warm = warm_from_three(common, rare, 12)
-    chosen = []
-    for _ in range(60):
-        chosen.append(warm.select())
-        if chosen[-1] == common:
-            warm.record((), common[0], 100, 50, 1.0, spent=0.02)
-            warm.record(common[:1], common[1], 50, 16, 1.0, spent=0.02)
-        else:
-            warm.record((), chosen[-1][0], 100, 12, 1.0, spent=0.02)
+    chosen = choices(warm, common, 60, 16, 12)
     assert chosen[0] == common and rare in chosen
 
 
