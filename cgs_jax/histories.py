@@ -302,11 +302,7 @@ class History:
         else:
             hazards, known, per_try = expected, trust, operator.seconds_per_try
         read_cost = sum(read.item_cost for read in self.reads)
-        self.item_cost = math.inf
-        for k, (success, tries) in enumerate(_within(hazards), start=1):
-            item_cost = (read_cost + tries * per_try) / max(success, 1e-12)
-            if item_cost < self.item_cost:
-                self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
+        self._try_as_pays(read_cost, per_try, _within(hazards))
         self.believed_cost = self.item_cost
         if own.attempts and own.attempts[0] < SETTLED * trust:
             hazards_believed = own.hazards(expected, min(trust, BELIEVED_TRIES))
@@ -321,16 +317,20 @@ class History:
             self.hopeful_success, tries = operator.hopeful[self.tries - 1]
         self.hopeful_cost = tries * per_try
 
-    def _predict_as_operator(self) -> None:
-        """Where nothing is known of the history itself: what is expected of its operator, which most histories share."""
-        operator = self.operator
-        per_try, within = operator.seconds_per_try, operator.within
-        read_cost = sum(read.item_cost for read in self.reads)
+    def _try_as_pays(self, read_cost: float, per_try: float, within: Sequence[tuple[float, float]]) -> None:
+        """As many tries as make an item cheapest."""
         self.item_cost = math.inf
         for k, (success, tries) in enumerate(within, start=1):
             item_cost = (read_cost + tries * per_try) / max(success, 1e-12)
             if item_cost < self.item_cost:
                 self.tries, self.success, self.cost, self.item_cost = k, success, tries * per_try, item_cost
+
+    def _predict_as_operator(self) -> None:
+        """Where nothing is known of the history itself: what is expected of its operator, which most histories share."""
+        operator = self.operator
+        per_try = operator.seconds_per_try
+        read_cost = sum(read.item_cost for read in self.reads)
+        self._try_as_pays(read_cost, per_try, operator.within)
         self.believed_cost = self.item_cost
         believed = sum(read.believed_cost for read in self.reads)
         if believed != read_cost:
