@@ -42,6 +42,9 @@ SUCCESS_PER_FREEDOM = 0.1
 SUCCESS_BOUNDS = 0.03, 0.8
 """Bounds of that guess."""
 
+DRAWN = 0.1
+"""Work of a try that solves nothing over that of one that solves for a configuration."""
+
 HARDNESS_LOOPS = 3.0
 """Weight, in loops, of the belief that an instance is as hard as guessed."""
 
@@ -655,10 +658,8 @@ class Records:
     def _operator(self, problem: Problem) -> PooledOperator:
         operator = self._operators.get(problem)
         if operator is None:
-            # The work of a solve grows with the square of its unknowns, and those are mostly configurations.
-            kinds = [self.transitions.graph.variable(name).kind for name in problem[0]]
-            guess = self.initial_cost * max(kinds.count("configuration"), 1) ** 2
             loops, per_loop = guessed_success(self.transitions.graph, problem)
+            guess = self.initial_cost * guessed_work(self.transitions.graph, problem)
             operator = self._operators[problem] = PooledOperator(loops, per_loop, guess, self._outlook)
         return operator
 
@@ -865,9 +866,10 @@ def _weight_of_mean(correlation: float) -> float:
 
 
 def _slowness(operators: Iterable[PooledOperator]) -> float:
-    """Device seconds over guessed ones."""
-    guessed = sum(operator.statistics.tries * operator.guess for operator in operators)
-    return sum(operator.statistics.seconds for operator in operators) / guessed if guessed else 1.0
+    """Device seconds over guessed ones, of operators that close loops: what is only drawn says nothing of them."""
+    solved = [operator for operator in operators if operator.loops and operator.statistics.tries]
+    guessed = sum(operator.statistics.tries * operator.guess for operator in solved)
+    return sum(operator.statistics.seconds for operator in solved) / guessed if guessed else 1.0
 
 
 def _ease(operators: Iterable[PooledOperator]) -> float:
@@ -924,6 +926,19 @@ def guessed_success(graph: ConstraintGraph, problem: Problem) -> tuple[int, floa
     loops = len(configurations) + len(ties)
     least, most = SUCCESS_BOUNDS
     return loops, min(max(SUCCESS_PER_FREEDOM * free / loops, least), most) if loops else most
+
+
+def guessed_work(graph: ConstraintGraph, problem: Problem) -> float:
+    """Work of a try over that of one for a single configuration, from the kinds of the new variables alone.
+
+    The work of a solve grows with the square of its unknowns. Those are the joints of every new configuration, which leaves one
+    pose or transform known with it; where there are more of these, every other one has nearly as many unknowns. What has no
+    loop to close (`guessed_success`) is drawn, not solved.
+    """
+    kinds = [graph.variable(name).kind for name in problem[0]]
+    configurations = kinds.count("configuration")
+    loops, _ = guessed_success(graph, problem)
+    return float(max(configurations, len(kinds) - configurations)) ** 2 if loops else DRAWN
 
 
 def _hopeful(hazards: Sequence[float], tries: float) -> list[float]:

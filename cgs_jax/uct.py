@@ -51,7 +51,10 @@ PRICE_STEPS = 2
 """Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
 CURIOSITY = 0.025
-"""First trials of operators may take this share of the time."""
+"""First trials of operators may take this share of the time in the beginning."""
+
+CURIOUS_SECONDS = 16.0
+"""And from then on so many times the logarithm of the time: operators that promise nothing are many, and most keep that."""
 
 KEEN_CURIOSITY = 0.15
 """Those of operators that may make the best sequence may take so much after `KEEN_AFTER`, unless the start was warm."""
@@ -73,8 +76,12 @@ EXPLORATION = 20.0
 every factor e of batches beyond so many: near ties cost more than they are worth, since what was made for one waits while
 another is run. Exploration thins out as the logarithm does in UCB."""
 
+SLIGHT_PROMISE = 1.03
+"""What promises more than the incumbent by this factor is looked at, however much was explored, in small batches: it becomes
+the incumbent, or soon promises no more."""
+
 PROMISE = 1.1
-"""What promises more than the incumbent by this factor is run at once, however much was explored."""
+"""What promises so much more is run at once in full batches, however much was explored."""
 
 EARLIER_PROMISE = 1.2
 """The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
@@ -92,6 +99,10 @@ DISAPPOINTED = 12
 REFRESH_SHARE = 16.0
 """All predictions are renewed when so many times as many batches as since the last time were run before it."""
 
+SETTLING = 256.0
+"""Batches until then. Later the time between grows with their square: by then little changes, and renewing takes time from the
+workers where these have all cores."""
+
 MOST_UNREFRESHED = 128.0
 """And at the latest after so many records, though a large tree may take longer."""
 
@@ -105,7 +116,7 @@ HOPELESS = 0.3
 """A sequence that would make less than this share of the incumbent's rate, if its first looks are believed, is not looked at
 further: often one step succeeds once in fifty times."""
 
-CLEARLY_MORE = 1.05
+CLEARLY_MORE = 1.02
 """By what factor another sequence must be predicted to be better before it takes the incumbent's place."""
 
 
@@ -207,7 +218,7 @@ class Tree(Records):
 
     @property
     def promised(self) -> Path:
-        """The sequence that was last run because it promised more than the incumbent."""
+        """The sequence that was last run because it promised clearly more than the incumbent (`PROMISE`)."""
         return self._promised
 
     @property
@@ -248,7 +259,7 @@ class Tree(Records):
         path = next(iter(self._prefixes.get(self.transitions.full, ())), path)
         if not path or path == incumbent:
             return incumbent
-        more = CLEARLY_MORE if exploring else PROMISE
+        more = CLEARLY_MORE if exploring else SLIGHT_PROMISE
         # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
             as_expected = self._rate_now(incumbent) >= UNLIKE * self._expected
@@ -256,8 +267,10 @@ class Tree(Records):
         if self._states is not None and self._advantage <= more:
             return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
-        if self._rate_now(path) > more * self._rate_now(incumbent):
-            self._promised = path
+        promise = self._rate_now(path) / self._rate_now(incumbent)
+        if promise > more:
+            if exploring or promise > PROMISE:
+                self._promised = path
             return path
         self._stale |= self._records_since_refresh > DISAPPOINTED
         return incumbent
@@ -329,9 +342,9 @@ class Tree(Records):
 
     def _may_try(self, keen: bool = False) -> bool:
         """Did first trials take less than their share of the time? keen: of what may make the best sequence."""
+        allowed = CURIOSITY * CURIOUS_SECONDS * math.log1p(self._total.spent / CURIOUS_SECONDS)
         if self._earlier_batches:
-            return self._total.first_trials + TRIAL_SECONDS <= CURIOSITY * self._total.spent
-        allowed = CURIOSITY * self._total.spent
+            return self._total.first_trials + TRIAL_SECONDS <= allowed
         if keen:
             allowed = max(allowed, KEEN_CURIOSITY * (self._total.spent - KEEN_AFTER))
         return self._total.first_trials <= allowed
@@ -473,7 +486,8 @@ class Tree(Records):
         )
         # A refresh visits every edge of the tree: its cost is spread over a proportional number of records. Early ones change
         # more than late ones.
-        share = min(self._total.visits / REFRESH_SHARE, MOST_UNREFRESHED)
+        visits = self._total.visits
+        share = min(visits / REFRESH_SHARE * max(visits / SETTLING, 1.0), MOST_UNREFRESHED)
         if first_time or self._records_since_refresh > max(DISAPPOINTED, share, self._edges_evaluated // 16):
             self._stale = True
         if self._stale:
