@@ -182,8 +182,9 @@ BATCH_SECONDS = 0.04
 LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
-EXPLORED = 2
-"""Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much."""
+EXPLORED = 1
+"""Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much, and what
+they read may have cost ten times what they take themselves."""
 
 PARTS_OF_KNOWN = 3
 """Batches of the sequence that is run whatever comes out of it grow by so many of these parts: until something has come through
