@@ -183,8 +183,8 @@ LOOKS = 8
 """Batches in one place grow over so many to their full size: what is only looked at must not cost much."""
 
 EXPLORED = 1
-"""Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much, and what
-they read may have cost ten times what they take themselves."""
+"""Once there is a sequence to be run, those of other sequences stop at so many of these parts: they tell nearly as much, and
+what they read may have cost ten times what they take themselves."""
 
 PARTS_OF_KNOWN = 3
 """Batches of the sequence that is run whatever comes out of it grow by so many of these parts: until something has come through
@@ -228,7 +228,7 @@ NICENESS = 10
 AUDIT_SAMPLES = 4096
 """Full samples that are audited at once: the calls to numpy cost as much as auditing several hundred of them."""
 
-AUDIT_BATCHES = 16
+AUDIT_BATCHES = 8
 """Batches after which full samples are audited, however few there are. In the beginning as soon as half as many wait as were
 found: whoever watches, or stops at a number of samples, should not wait for the first ones."""
 
