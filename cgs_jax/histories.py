@@ -19,7 +19,7 @@ stale. The rules that choose are in `uct`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from operator import attrgetter, itemgetter
@@ -509,13 +509,16 @@ class Records:
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
-        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; of those that
-        differ only in the order of independent steps one."""
+        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; on earlier instances
+        only where none was here. Of those that differ only in the order of independent steps one."""
         self._predict_operators()
-        paths = self._finished_paths(self._known)
+        made = {history for history in self._known if history.statistics.visits}
+        if not self._finished_paths(made):
+            made = set(self._known)
+        paths = self._finished_paths(history for history in self._known if history in made)
         if self._states is not None:
             # The cheapest way to a state may be one that was not gone on, and then takes the place of one that was.
-            paths = [*self._cheapest_paths(k, only_made=True)[self.transitions.full], *paths]
+            paths = [*self._cheapest_paths(k, made=made)[self.transitions.full], *paths]
         distinct: dict[frozenset[History], Path] = {}
         for path in paths:
             distinct.setdefault(frozenset(self._made_along(path)[0]), path)
@@ -544,12 +547,12 @@ class Records:
         self,
         k: int,
         among: Callable[[Step], bool] = lambda step: True,
-        only_made: bool = False,
+        made: Container[History] | None = None,
         cost_of: Callable[[History], float] = attrgetter("item_cost"),
     ) -> dict[State, list[Path]]:
         """In every state the k partial sequences of least production cost, out of some steps, by a forward search.
 
-        only_made: whether all their histories must have been made, here or on earlier instances.
+        made: the histories that they may consist of; None for all.
         """
         # Cost, components, and the last transition with the label before it. Sequences that differ only in the order of
         # independent steps end with the same components: of these the first of the cheapest.
@@ -566,7 +569,7 @@ class Records:
                 others = partial[step.target]
                 for label in labels:
                     history, kept = self._made_again(step, label[1])
-                    if only_made and not history.prefixes:
+                    if made is not None and history not in made:
                         continue
                     if history.version != version:
                         self._predicted(history)

@@ -83,15 +83,13 @@ the incumbent, or soon promises no more."""
 PROMISE = 1.1
 """What promises so much more is run at once in full batches, however much was explored."""
 
-EARLIER_PROMISE = 1.2
-"""The same after a warm start for what was not run here yet: the incumbent did best on the earlier instances already."""
-
 FIRST_PROMISE = 2.0
-"""The same until `KEEN_AFTER`: what other instances promise often does not hold, and it takes half a second each to tell."""
+"""After a warm start what was not run here yet must promise so much more until `KEEN_AFTER`, and `PROMISE` times as much from
+then on: what other instances promise often does not hold, and it takes half a second each to tell."""
 
 UNLIKE = 0.5
 """But where the incumbent makes less than this share of what it made of the earlier instances on average, this instance is
-unlike them, and `EARLIER_PROMISE` holds from the beginning."""
+unlike them, and `PROMISE` is enough from the beginning."""
 
 DISAPPOINTED = 12
 """Records after which another best sequence is looked for when that of the last refresh is none any more."""
@@ -263,7 +261,7 @@ class Tree(Records):
         # What was not run here promises what others made of it, or what its operators did on average.
         if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
             as_expected = self._rate_now(incumbent) >= UNLIKE * self._expected
-            more = FIRST_PROMISE if self._total.spent < KEEN_AFTER and as_expected else EARLIER_PROMISE
+            more = FIRST_PROMISE if self._total.spent < KEEN_AFTER and as_expected else PROMISE
         if self._states is not None and self._advantage <= more:
             return incumbent
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.

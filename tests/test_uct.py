@@ -552,6 +552,17 @@ def test_a_warm_start_leaves_what_is_proven_sooner_where_that_makes_much_less_th
     assert chosen[0] == common and rare in chosen
 
 
+def test_the_best_sequences_after_a_warm_start_are_those_that_were_run_here():
+    """(a,b) made twice as much on an earlier instance: that tells nothing of this one's samples."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    warm = warm_from_three(common, rare, 50)
+    assert [path for path, _ in warm.best_sequences(3)] == [rare, common]  # nothing was run yet
+    warm.record((), common[0], 100, 50, 1.0)
+    warm.record(common[:1], common[1], 50, 50, 1.0)
+    assert [path for path, _ in warm.best_sequences(3)] == [common]
+
+
 def test_a_warm_start_keeps_how_further_tries_fall_off_where_instances_differ():
     transitions = pair_graph()
     (step,) = transitions.parse("(a,b)")
