@@ -509,8 +509,8 @@ class Records:
         return history
 
     def best_sequences(self, k: int = 1) -> list[tuple[Path, float]]:
-        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; on earlier instances
-        only where none was here. Of those that differ only in the order of independent steps one."""
+        """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; on earlier
+        instances only where none was here. Of those that differ only in the order of independent steps one."""
         self._predict_operators()
         made = {history for history in self._known if history.statistics.visits}
         if not self._finished_paths(made):
