@@ -229,8 +229,8 @@ class Tree(Records):
 
         ready: tells whether a transition's operator can run; asked of one transition per conditional problem. Without
         a complete sequence of ready transitions the answer is (). That is the incumbent, unless there is none, another one
-        is predicted to be much better, or it is time to explore (`EXPLORATION`) or to try an operator that never ran
-        (`CURIOSITY`).
+        is predicted to be better (`SLIGHT_PROMISE`), or it is time to explore (`EXPLORATION`) or to try an operator that never
+        ran (`CURIOSITY`).
         """
         self._ask_readiness(ready)
         if self._stale:
