@@ -7,8 +7,8 @@
   histories do not matter a lot, where the operator succeeds four times as often after one as after another very little.
 * A condition may be tried several times. Those that still wait for another try are censored observations: success is
   counted per try, and success within all tries follows by the product of Kaplan and Meier (1958).
-* What never ran is judged by its dof and rows (`guessed_success`), corrected by how the instance's operators that ran did
-  in comparison; how many tries of a condition pay follows from what it cost.
+* What never ran is judged by its dof and rows (`guessed_success`) and by its unknowns (`guessed_work`), corrected by how the
+  instance's operators that ran did in comparison; how many tries of a condition pay follows from what it cost.
 * On another instance an operator may do worse than on those of a warm start: a history borrows how it did in comparison
   with its operator there, so that none has to be refuted one by one.
 
@@ -477,7 +477,7 @@ class Records:
         """Predicted finished samples per second of device time when only this sequence is run.
 
         Uses the statistics of its own histories where there are some, those of its operators otherwise, and a guess
-        (`guessed_success` at `initial_cost`) for an operator that never ran. Raises InputError for an incomplete sequence.
+        (`guessed_success`, `guessed_work`) for an operator that never ran. Raises InputError for an incomplete sequence.
         """
         path = tuple(path)
         state: State = path[-1].target if path else frozenset()
@@ -512,13 +512,13 @@ class Records:
         """The k sequences of greatest predicted rate, with that rate, out of those that were run to the end; on earlier
         instances only where none was here. Of those that differ only in the order of independent steps one."""
         self._predict_operators()
-        made = {history for history in self._known if history.statistics.visits}
+        made = self._made_here
         if not self._finished_paths(made):
-            made = set(self._known)
-        paths = self._finished_paths(history for history in self._known if history in made)
+            made = self._known
+        paths = self._finished_paths(made)
         if self._states is not None:
             # The cheapest way to a state may be one that was not gone on, and then takes the place of one that was.
-            paths = [*self._cheapest_paths(k, made=made)[self.transitions.full], *paths]
+            paths = [*self._cheapest_paths(k, made=set(made))[self.transitions.full], *paths]
         distinct: dict[frozenset[History], Path] = {}
         for path in paths:
             distinct.setdefault(frozenset(self._made_along(path)[0]), path)
@@ -538,6 +538,11 @@ class Records:
             components = (*kept, history)
             histories = (*histories, history)
         return components, histories
+
+    @property
+    def _made_here(self) -> list[History]:
+        """The histories that were made in this run, not on earlier instances alone."""
+        return [history for history in self._known if history.statistics.visits]
 
     def _finished_paths(self, histories: Iterable[History]) -> list[Path]:
         full = self.transitions.full

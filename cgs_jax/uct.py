@@ -51,10 +51,10 @@ PRICE_STEPS = 2
 """Steps of Dinkelbach's iteration at a refresh; the first one or two make most of the difference."""
 
 CURIOSITY = 0.025
-"""First trials of operators may take this share of the time in the beginning."""
+"""First trials of operators may take this share of the time in the beginning (`CURIOUS_SECONDS`)."""
 
 CURIOUS_SECONDS = 16.0
-"""And from then on so many times the logarithm of the time: operators that promise nothing are many, and most keep that."""
+"""Time of the workers after which that share thins out as the logarithm does: what promises nothing mostly goes on doing so."""
 
 KEEN_CURIOSITY = 0.15
 """Those of operators that may make the best sequence may take so much after `KEEN_AFTER`, unless the start was warm."""
@@ -153,7 +153,7 @@ class Tree(Records):
     equivalent_visits: an operator's visits after other histories count on an edge like up to so many visits of its own,
     so that not every child of every node is tried anew. retain: on failure the components which the failed transition
     does not touch are kept and combined again; without it the whole partial sample is dropped. discount: factor on old
-    evidence per visit. initial_cost: guessed seconds per try of an operator that never ran.
+    evidence per visit. initial_cost: guessed seconds per try of an operator that makes one configuration and never ran.
 
     Every kept transition is tried again and again: its bonus grows with the logarithm of its siblings' visits, while
     what its operator does elsewhere counts at most `equivalent_visits`.
@@ -267,7 +267,7 @@ class Tree(Records):
         # By what is known now, not at the last refresh: what disappoints at its first steps is not followed to the end.
         promise = self._rate_now(path) / self._rate_now(incumbent)
         if promise > more:
-            if exploring or promise > PROMISE:
+            if promise > PROMISE:
                 self._promised = path
             return path
         self._stale |= self._records_since_refresh > DISAPPOINTED
@@ -327,8 +327,7 @@ class Tree(Records):
             return
         if not self._incumbent and self._proven:
             self._incumbent, self._of_incumbent = self._proven, frozenset(self._made_along(self._proven)[1])
-        here = [history for history in self._known if history.statistics.visits]
-        rates = [(self._rate_of(path), path) for path in self._finished_paths(here)]
+        rates = [(self._rate_of(path), path) for path in self._finished_paths(self._made_here)]
         rate, path = max(rates, default=(0.0, ()), key=lambda pair: pair[0])
         if path and (not self._incumbent or rate > CLEARLY_MORE * self._rate_of(self._incumbent)):
             self._incumbent, self._of_incumbent = path, frozenset(self._made_along(path)[1])
