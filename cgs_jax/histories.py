@@ -91,7 +91,14 @@ PROVEN_VISITS = 2.0
 """Batches of its last operator from which on an earlier instance tells what rate a sequence had there."""
 
 UNPROVEN = 0.5
-"""Share of the greatest rate of an earlier instance that a sequence is believed to have had there where it was not run."""
+"""Share of the greatest rate of an earlier instance that a sequence is believed to have had there where one of its operators
+was not run."""
+
+PORTFOLIO = 3
+"""Sequences at most that a warm start looks at first."""
+
+WORTH_A_LOOK = 0.03
+"""Share of the greatest rate that another of these must add to the best of the others, on average over earlier instances."""
 
 BELIEVED_TRIES = 8.0
 """Weight, in tries, of what an operator does on average where the first looks after a history are believed."""
@@ -375,6 +382,32 @@ class Node:
         self.epoch = -1
 
 
+class _Earlier:
+    """What is known of an earlier instance alone."""
+
+    def __init__(self, operators: dict[PooledOperator, Statistics], histories: dict[History, Statistics]) -> None:
+        self.operators = operators
+        self.histories = histories
+        self._seconds: dict[History, float] = {}
+
+    def ended(self, history: History, full: State) -> bool:
+        """Was the sequence that makes this run there to the end?"""
+        return history.made == full and history in self.histories and self.histories[history].visits >= PROVEN_VISITS
+
+    def seconds_per_item(self, history: History) -> float:
+        """Device seconds per item of a history there, with all that it is made of; infinite where an operator was not run."""
+        if history not in self._seconds:
+            self._seconds[history] = math.inf
+            pooled, own = self.operators.get(history.operator), self.histories.get(history, Statistics())
+            if pooled is not None and pooled.observed:
+                borrowed = OPERATOR_TIME_TRIES * pooled.seconds / pooled.tries
+                per_try = (own.seconds + borrowed) / (own.tries + OPERATOR_TIME_TRIES)
+                reads = sum(map(self.seconds_per_item, history.reads))
+                within = _within(own.hazards(pooled.observed, 1.0 / CORRELATION - 1.0))
+                self._seconds[history] = min(max(reads + tries * per_try, 1e-300) / max(s, 1e-12) for s, tries in within)
+        return self._seconds[history]
+
+
 class Records:
     """Statistics of a run whatever the rule of choice, and the predictions that follow from them (see Tree)."""
 
@@ -404,7 +437,7 @@ class Records:
         self._outlook = Outlook()
         self._root = self._node_of(frozenset(), ())
         self._total = Totals()
-        self._proven: Path = ()  # on earlier instances
+        self._portfolio: list[Path] = []  # of earlier instances
         self._version = 0  # of the predictions
 
     # What happened
@@ -821,21 +854,25 @@ class Records:
             raise InputError("warm start comes before the first record; this chooser has records already")
         if not n_equiv > 0:
             raise InputError(f"n_equiv is {n_equiv} batches; expected more than 0")
-        of_operator: dict[Problem, list[Statistics]] = {}
+        of_operator: dict[PooledOperator, list[Statistics]] = {}
         of_history: dict[History, list[Statistics]] = {}
-        by_instance: list[dict[History, Statistics]] = []
+        instances: list[_Earlier] = []
         totals = []
         for data in earlier:
-            for problem, entry in operators_in(self.transitions, data).items():
-                of_operator.setdefault(problem, []).append(_read_statistics(entry))
-            there = {self._history_at(entry["sequence"]): _read_statistics(entry) for entry in data["sequences"]}
-            for history, known in there.items():
+            entries = operators_in(self.transitions, data).items()
+            there = _Earlier(
+                {self._operator(problem): _read_statistics(entry) for problem, entry in entries},
+                {self._history_at(entry["sequence"]): _read_statistics(entry) for entry in data["sequences"]},
+            )
+            for operator, known in there.operators.items():
+                of_operator.setdefault(operator, []).append(known)
+            for history, known in there.histories.items():
                 of_history.setdefault(history, []).append(known)
-            by_instance.append(there)
+            instances.append(there)
             totals.append(Totals(**data["totals"]))
-        for problem, statistics in of_operator.items():
-            self._operator(problem).statistics = _averaged(statistics, n_equiv)
-        self._proven = self._proven_on(by_instance)
+        for operator, statistics in of_operator.items():
+            operator.statistics = _averaged(statistics, n_equiv)
+        self._portfolio = self._portfolio_of(instances)
         for history, statistics in of_history.items():
             history.borrowed = _averaged(statistics, n_equiv)
             ours, pooled = history.borrowed.observed, history.operator.statistics.observed
@@ -849,23 +886,29 @@ class Records:
             self._total = Totals(rollouts=roots * seconds, samples=rate * seconds, seconds=seconds)
         self._predict_operators()
 
-    def _proven_on(self, instances: list[dict[History, Statistics]]) -> Path:
-        """The sequence that did best on instances, by the rates it had there over the greatest ones; () without any.
+    def _portfolio_of(self, instances: list[_Earlier]) -> list[Path]:
+        """A few sequences of which on every instance one did well, the best one on its own first; none without any.
 
-        Averages of predictions would favour what was run on few instances, those where it is good, and promises much elsewhere.
+        By the rate that each made there, or what its operators let expect, over the greatest one. Averages of predictions would
+        favour what was run on few instances, those where it is good, and promises much elsewhere.
         """
-        shares: dict[History, list[float]] = {}
+        full = self.transitions.full
+        shares: dict[History, list[float]] = {h: [] for there in instances for h in there.histories if there.ended(h, full)}
         for there in instances:
-            costs: dict[History, float] = {}
-            ended = [h for h, known in there.items() if h.made == self.transitions.full and known.visits >= PROVEN_VISITS]
-            rates = {history: 1.0 / max(_cost_there(history, there, costs), 1e-300) for history in ended}
-            greatest = max(rates.values(), default=0.0)
+            rates = {history: 1.0 / there.seconds_per_item(history) for history in shares}
+            greatest = max((rate for history, rate in rates.items() if there.ended(history, full)), default=0.0)
             for history, rate in rates.items():
-                if greatest > 0.0:
-                    shares.setdefault(history, []).append(rate / greatest)
-        # A share more than a sequence would have that was not run is what an instance says for it.
-        best = max(shares, key=lambda history: sum(share - UNPROVEN for share in shares[history]), default=None)
-        return best.prefixes[0] if best else ()
+                shares[history].append(min(rate / greatest, 1.0) if rate and greatest else UNPROVEN)
+        chosen: list[History] = []
+        so_far = [0.0] * len(instances)
+        while len(chosen) < PORTFOLIO:
+            gain = {h: sum(max(s - f, 0.0) for s, f in zip(of, so_far)) / len(instances) for h, of in shares.items()}
+            best = max(gain, key=lambda history: gain[history], default=None)
+            if best is None or gain[best] <= WORTH_A_LOOK:
+                break
+            chosen.append(best)
+            so_far = [max(s, f) for s, f in zip(shares[best], so_far)]
+        return [history.prefixes[0] for history in chosen]
 
 
 def _weight_of_mean(correlation: float) -> float:
@@ -962,18 +1005,6 @@ def _within(hazards: Sequence[float]) -> list[tuple[float, float]]:
         failed *= 1.0 - hazard
         result.append((1.0 - failed, tries))
     return result
-
-
-def _cost_there(history: History, there: dict[History, Statistics], costs: dict[History, float]) -> float:
-    """Device seconds per item of a history by what was seen on one instance alone; infinite where that tells nothing."""
-    if history not in costs:
-        known = there.get(history)
-        costs[history] = math.inf
-        if known is not None and known.observed:
-            reads = sum(_cost_there(read, there, costs) for read in history.reads)
-            within = _within(known.observed)
-            costs[history] = min((reads + tries * known.seconds / known.tries) / max(s, 1e-12) for s, tries in within)
-    return costs[history]
 
 
 def _add(to: Statistics, other: Statistics) -> None:

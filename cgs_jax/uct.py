@@ -87,6 +87,12 @@ FIRST_PROMISE = 2.0
 """After a warm start what was not run here yet must promise so much more until `KEEN_AFTER`, and `PROMISE` times as much from
 then on: what other instances promise often does not hold, and it takes half a second each to tell."""
 
+LOOK_EVERY = 2
+"""One choice in so many looks at those of the earlier instances' portfolio that were not run here yet."""
+
+LOOK_SUCCESSES = 4.0
+"""And goes on until so many finished samples tell what they make, or that is hopeless."""
+
 UNLIKE = 0.5
 """But where the incumbent makes less than this share of what it made of the earlier instances on average, this instance is
 unlike them, and `PROMISE` is enough from the beginning."""
@@ -189,7 +195,7 @@ class Tree(Records):
         self._untried_at = -1  # epoch
         self._untried: tuple[float, Path] = (-math.inf, ())
         self._earlier_batches = 0.0  # of an earlier instance
-        self._expected = 0.0  # rate of what was proven on earlier instances, samples per second
+        self._expected = 0.0  # rate of the first sequence of the portfolio on earlier instances, samples per second
         self._incumbent: Path = ()
         self._promised: Path = ()
         self._believed: Path = ()  # would be better than the incumbent if its first looks told the truth
@@ -237,6 +243,8 @@ class Tree(Records):
             self._refresh()
         price = self.price
         self._choices += 1
+        if self._portfolio and (path := self._unseen_of_portfolio()):
+            return path
         untried = self._path_to_untried() if self._curious else ()
         if untried:
             return untried
@@ -259,7 +267,8 @@ class Tree(Records):
             return incumbent
         more = CLEARLY_MORE if exploring else SLIGHT_PROMISE
         # What was not run here promises what others made of it, or what its operators did on average.
-        if self._proven and not all(history.statistics.visits for history in self._made_along(path)[1]):
+        borrowed = self._portfolio and not all(history.statistics.visits for history in self._made_along(path)[1])
+        if borrowed:
             as_expected = self._rate_now(incumbent) >= UNLIKE * self._expected
             more = FIRST_PROMISE if self._total.spent < KEEN_AFTER and as_expected else PROMISE
         if self._states is not None and self._advantage <= more:
@@ -280,6 +289,18 @@ class Tree(Records):
         components, _ = self._made_along(path)
         cost = sum(self._renewed(history).believed_cost for history in components)
         return cost * HOPELESS * self._rate_now(self._incumbent) > 1.0
+
+    def _unseen_of_portfolio(self) -> Path:
+        """A sequence of the portfolio that is to be looked at here; () where all were or that must wait."""
+        if self._choices % LOOK_EVERY or self._total.spent >= KEEN_AFTER:
+            return ()
+        for path in self._portfolio[1:]:
+            last = self._made_along(path)[1][-1]
+            if sum(last.statistics.successes) >= LOOK_SUCCESSES or self.hopeless(path):
+                continue
+            if all(self._is_ready(self._step(transition)) for transition in path):
+                return path
+        return ()
 
     def _promising(self, price: float) -> Path:
         """The sequence that the tree chooses by Q and bonus, step by step; () where none is ready."""
@@ -308,7 +329,7 @@ class Tree(Records):
     @property
     def _allowed_to_explore(self) -> float:
         """Batches that may have gone by now into other sequences than the incumbent."""
-        if self._proven and self._total.spent < KEEN_AFTER:
+        if self._portfolio and self._total.spent < KEEN_AFTER:
             return 0.0
         # After a warm start as little from the beginning as at the end of the earlier runs.
         return EXPLORATION * math.log1p(self._total.batches / (self._earlier_batches + EXPLORATION))
@@ -322,11 +343,12 @@ class Tree(Records):
 
     def _renew_incumbent(self) -> None:
         """The sequence of greatest predicted rate of those that were run to the end, if that is clearly more; after a warm
-        start the one that is proven, until another was."""
+        start the first one of the portfolio, until another was."""
         if self.reward != "rate":
             return
-        if not self._incumbent and self._proven:
-            self._incumbent, self._of_incumbent = self._proven, frozenset(self._made_along(self._proven)[1])
+        if not self._incumbent and self._portfolio:
+            self._incumbent = self._portfolio[0]
+            self._of_incumbent = frozenset(self._made_along(self._incumbent)[1])
         rates = [(self._rate_of(path), path) for path in self._finished_paths(self._made_here)]
         rate, path = max(rates, default=(0.0, ()), key=lambda pair: pair[0])
         if path and (not self._incumbent or rate > CLEARLY_MORE * self._rate_of(self._incumbent)):
@@ -691,8 +713,8 @@ class Tree(Records):
     def warm_start(self, earlier: Sequence[dict[str, Any]], n_equiv: float) -> None:
         super().warm_start(earlier, n_equiv)
         self._earlier_batches = sum(data["totals"].get("batches", 0.0) for data in earlier) / max(len(earlier), 1)
-        if self._proven:
-            self._expected = self._rate_of(self._proven)
+        if self._portfolio:
+            self._expected = self._rate_of(self._portfolio[0])
         self._stale = True
 
     @classmethod

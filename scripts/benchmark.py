@@ -698,6 +698,7 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
     """How near a method comes to the best sequence in simulated runs, in every instance that a study has run.
 
     Each round draws another world; its best sequence is known and is simulated too, so that both have the same overheads.
+    tree-warm starts from a tree of every other instance.
     """
     from cgs_jax import load_problem
     from cgs_jax.api import make_chooser
@@ -711,11 +712,11 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
     report: dict[str, Any] = {"seconds": seconds, "rounds": given.rounds, "method": given.method, "scenes": {}}
     for scene in given.scenes:
         rows = {}
-        for instance in given.instances:
-            trees = store.trees(scene, instance)
-            if not trees:
-                continue
+        known = {instance: trees for instance in given.instances if (trees := store.trees(scene, instance))}
+        for instance, trees in known.items():
             problem = load_problem(scene, instance)
+            warm = given.method == "tree-warm"
+            prior = [others[0] for other, others in known.items() if warm and other != instance]
             shares = []
             for seed in range(given.seed, given.seed + given.rounds):
                 world = World(problem, trees, seed)
@@ -724,7 +725,7 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
                 attainable = final_rate(best, seconds)
                 if not attainable:
                     raise InputError(f"the best sequence of {scene} makes nothing in {seconds:g} s, expected more --seconds")
-                chooser = make_chooser(problem, given.method, seed)
+                chooser = make_chooser(problem, given.method, seed, prior)
                 found = simulate(world, chooser, seed, seconds)
                 ended = chooser.best_sequences(1)
                 early = 0.2 * seconds

@@ -493,8 +493,8 @@ def test_a_warm_start_explores_after_the_first_samples():
     assert set(chosen[:100]) == {best} and set(chosen[100:]) > {best}
 
 
-def warm_from_three(common, rare, successes):
-    """Starts from three instances: the common sequence makes 25 samples/s on all, the rare one ran on one of them."""
+def warm_from_three(common, rare, successes, batches=200):
+    """Starts from three instances: the common sequence makes 25 samples/s on all, the rare one ran on the last of them."""
     transitions = pair_graph()
     earlier = []
     for instance in range(3):
@@ -502,7 +502,7 @@ def warm_from_three(common, rare, successes):
         for _ in range(200):
             tree.record((), common[0], 100, 50, 1.0)
             tree.record(common[:1], common[1], 50, 50, 1.0)
-            if instance == 2:
+            if instance == 2 and tree.operator_statistics()[common[0].problem].visits <= batches:
                 tree.record((), rare[0], 100, successes, 1.0)
         earlier.append(tree.as_json())
     warm = Tree(transitions)
@@ -534,10 +534,10 @@ def test_a_warm_start_begins_with_what_did_well_on_most_instances():
 
 @pytest.mark.parametrize(("promised", "left_at_once"), [(40, False), (60, True)])
 def test_a_warm_start_leaves_what_is_proven_at_first_for_twice_as_much_only(promised, left_at_once):
-    """a then b: 25 samples/s on three instances and here. (a,b): 40 or 60 on the one where it was run, and none here."""
+    """a then b: 25 samples/s on three instances and here. (a,b): 40 or 60 in its only batch there, and none here."""
     transitions = pair_graph()
     common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
-    warm = warm_from_three(common, rare, promised)
+    warm = warm_from_three(common, rare, promised, batches=1)
     chosen = choices(warm, common, 200, 50, 0)
     assert (rare in chosen[:90]) == left_at_once
     assert rare in chosen
@@ -550,6 +550,36 @@ def test_a_warm_start_leaves_what_is_proven_sooner_where_that_makes_much_less_th
     warm = warm_from_three(common, rare, 12)
     chosen = choices(warm, common, 60, 16, 12)
     assert chosen[0] == common and rare in chosen
+
+
+@pytest.mark.parametrize("here", [30, 15, 0])
+def test_a_warm_start_looks_at_what_did_better_on_some_instances(here):
+    """a then b: 25 samples/s on three instances and here. (a,b): 40 on one of them; 30, 15 or none of a batch of 100 here."""
+    transitions = pair_graph()
+    common, rare = transitions.parse("a; b"), transitions.parse("(a,b)")
+    chosen = choices(warm_from_three(common, rare, 40), common, 40, 50, here)
+    assert chosen[:2] == [common, rare]
+    better, worse = (rare, common) if here > 25 else (common, rare)
+    assert chosen[-10:].count(better) > 5 and worse not in chosen[-10:]
+
+
+def test_a_warm_start_begins_with_the_few_sequences_of_which_one_did_well_everywhere():
+    """Rates there on paper, a then b, b then a, (a,b): 25, 20, 5 on two instances; 25, 24, 50 on the third."""
+    transitions = pair_graph()
+    rates = [(25, 20, 5), (25, 20, 5), (25, 24, 50)]
+    common, second, rare = (transitions.parse(text) for text in ("a; b", "b; a", "(a,b)"))
+    earlier = []
+    for of_common, of_second, of_rare in rates:
+        tree = Tree(transitions)
+        for _ in range(200):
+            for path, rate in ((common, of_common), (second, of_second)):
+                tree.record((), path[0], 100, 2 * rate, 1.0)
+                tree.record(path[:1], path[1], 2 * rate, 2 * rate, 1.0)
+            tree.record((), rare[0], 100, of_rare, 1.0)
+        earlier.append(tree.as_json())
+    warm = Tree(transitions)
+    warm.warm_start(earlier, n_equiv=5)
+    assert warm._portfolio == [common, rare]
 
 
 def test_the_best_sequences_after_a_warm_start_are_those_that_were_run_here():
