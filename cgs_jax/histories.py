@@ -249,7 +249,7 @@ class PooledOperator:
 
     def seconds_per_item(self, item_cost: float) -> float:
         """With as many tries as are worth making, when what is read costs so many seconds."""
-        return min((item_cost + tries * self.seconds_per_try) / max(success, 1e-12) for success, tries in self.within)
+        return _seconds_per_item(item_cost, self.seconds_per_try, self.within)
 
 
 class Step:
@@ -320,8 +320,7 @@ class History:
             hazards_believed = hazards
         if hazards_believed is not hazards or any(read.believed_cost != read.item_cost for read in self.reads):
             read_cost = sum(read.believed_cost for read in self.reads)
-            within = _within(hazards_believed)
-            self.believed_cost = min((read_cost + tries * per_try) / max(success, 1e-12) for success, tries in within)
+            self.believed_cost = _seconds_per_item(read_cost, per_try, _within(hazards_believed))
         self.hopeful_success, tries = _within(_hopeful(hazards, known))[self.tries - 1]
         if own.tries + self.borrowed.tries < VISIT_TRIES and operator.hopeful[self.tries - 1][0] > self.hopeful_success:
             self.hopeful_success, tries = operator.hopeful[self.tries - 1]
@@ -404,7 +403,7 @@ class _Earlier:
                 per_try = (own.seconds + borrowed) / (own.tries + OPERATOR_TIME_TRIES)
                 reads = sum(map(self.seconds_per_item, history.reads))
                 within = _within(own.hazards(pooled.observed, 1.0 / CORRELATION - 1.0))
-                self._seconds[history] = min(max(reads + tries * per_try, 1e-300) / max(s, 1e-12) for s, tries in within)
+                self._seconds[history] = max(_seconds_per_item(reads, per_try, within), 1e-300)
         return self._seconds[history]
 
 
@@ -1005,6 +1004,11 @@ def _within(hazards: Sequence[float]) -> list[tuple[float, float]]:
         failed *= 1.0 - hazard
         result.append((1.0 - failed, tries))
     return result
+
+
+def _seconds_per_item(read_cost: float, per_try: float, within: Iterable[tuple[float, float]]) -> float:
+    """With as many tries as are worth making. read_cost: seconds per condition; within: as of `_within`."""
+    return min((read_cost + tries * per_try) / max(success, 1e-12) for success, tries in within)
 
 
 def _add(to: Statistics, other: Statistics) -> None:
