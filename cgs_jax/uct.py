@@ -267,8 +267,7 @@ class Tree(Records):
             return incumbent
         more = CLEARLY_MORE if exploring else SLIGHT_PROMISE
         # What was not run here promises what others made of it, or what its operators did on average.
-        borrowed = self._portfolio and not all(history.statistics.visits for history in self._made_along(path)[1])
-        if borrowed:
+        if self._portfolio and not all(history.statistics.visits for history in self._made_along(path)[1]):
             as_expected = self._rate_now(incumbent) >= UNLIKE * self._expected
             more = FIRST_PROMISE if self._total.spent < KEEN_AFTER and as_expected else PROMISE
         if self._states is not None and self._advantage <= more:
@@ -296,9 +295,8 @@ class Tree(Records):
             return ()
         for path in self._portfolio[1:]:
             last = self._made_along(path)[1][-1]
-            if sum(last.statistics.successes) >= LOOK_SUCCESSES or self.hopeless(path):
-                continue
-            if all(self._is_ready(self._step(transition)) for transition in path):
+            is_known = sum(last.statistics.successes) >= LOOK_SUCCESSES or self.hopeless(path)
+            if not is_known and all(self._is_ready(self._step(transition)) for transition in path):
                 return path
         return ()
 

@@ -715,8 +715,8 @@ def search(given: argparse.Namespace) -> dict[str, Any]:
         known = {instance: trees for instance in given.instances if (trees := store.trees(scene, instance))}
         for instance, trees in known.items():
             problem = load_problem(scene, instance)
-            warm = given.method == "tree-warm"
-            prior = [others[0] for other, others in known.items() if warm and other != instance]
+            others = [of_other[0] for other, of_other in known.items() if other != instance]
+            prior = others if given.method == "tree-warm" else []
             shares = []
             for seed in range(given.seed, given.seed + given.rounds):
                 world = World(problem, trees, seed)
@@ -1119,6 +1119,8 @@ def check(given: argparse.Namespace) -> list[str]:
         raise InputError(f"expected --seconds above 0 and --rounds of at least 1, got {given.seconds:g} and {given.rounds}")
     if given.results and not given.against:
         raise InputError("--results is only compared, expected --against FILE beside it")
+    if "search" in given.parts and given.method == "tree-warm" and len(given.instances) < 2:
+        raise InputError("tree-warm starts from runs on other instances, expected at least two in --instances")
     parts = [*given.parts, *([given.peer] if given.peer else [])]
     return parts or list(WITHOUT_BEING_ASKED)
 

@@ -86,6 +86,7 @@ def test_gate_tells_by_its_exit_status(benchmark, tmp_path, rate, only, status):
         (["throughput", "--scenes", "kitchen"], "kitchen"),
         (["throughput", "--scenes", "pick_place", "--instances", "8"], "8"),
         (["throughput", "--seconds", "0"], "--seconds"),
+        (["search", "--method", "tree-warm", "--instances", "0"], "at least two in --instances"),
     ],
 )
 def test_wrong_input_is_told_in_one_line(tmp_path, arguments, told):

@@ -163,6 +163,7 @@ def benchmark(arguments, monkeypatch):
 
 
 STUDIES = set()
+"""Arguments of the studies that were rehearsed already."""
 
 
 def reproduce(arguments, monkeypatch):

@@ -245,7 +245,8 @@ def robots(folder):
 def measurements(folder):
     """Mistakes in calls of benchmark.py."""
     command = load_script("benchmark")
-    for line in ("speed", "--peer-scenes mars", "--seconds 0", "--results x.json"):
+    alone = "search --method tree-warm --instances 0"
+    for line in ("speed", "--peer-scenes mars", "--seconds 0", "--results x.json", alone):
         yield lambda line=line: command.check(command.parse().parse_args(line.split()))
     yield lambda: command.read_result(folder / "nowhere.json")
     yield lambda: command.read_result(folder / "list.json")
