@@ -164,7 +164,7 @@ def test_operation_is_named_as_in_the_record():
 BUDGET = Budget(
     seconds=2.0, seeds=2, instances=2, coverage_least=20, sweep_instances=1, sweep_seeds=1, prices=(0.1, 1.0),
     exploration=(0.3,), oracle_instances=1, survey_seconds_per_operator=0.01, screened=3, screen_seconds=0.5,
-    printed_seconds=0.5, turns_seconds=1.0, turns_seeds=2, operation_seconds=0.5,
+    printed_seconds=0.5, settling_seconds=2.0, turns_seconds=1.0, turns_seeds=2, operation_seconds=0.5,
 )  # fmt: skip
 
 
@@ -210,7 +210,7 @@ def test_what_ran_side_by_side_is_run_again_together(finished):
     count = len(made)
     list(Study(whole.folder, ["handover"], BUDGET, PAPER).execute())
     assert [(run.method, run.seed) for run in made[count:]] == [("tree", 1), ("best expert", 1), ("best found", 1)]
-    assert {(run.instance, run.seconds) for run in made[count:]} == {(0, 1.0)}
+    assert [(run.instance, run.seconds) for run in made[count:]] == [(0, 3.0), (0, 1.0), (0, 1.0)]
     del made[count:]
 
 
@@ -250,6 +250,27 @@ def test_side_by_side_everyone_has_its_own_time_and_waits_for_the_others(monkeyp
         assert 0.6 <= kept.data["meta"]["elapsed"] < 0.6 + 0.5 * passed
         assert len(kept.elapsed) and kept.elapsed.max() > 0.3
     assert passed > first.data["meta"]["elapsed"] + second.data["meta"]["elapsed"] - 0.01
+
+
+def test_a_longer_run_begins_alone_and_ends_with_those_beside_it(monkeypatch):
+    at = problem("pick_place")
+    order = []
+    go_on = runs._Competitor.go_on
+
+    def spy(self, seconds):
+        order.append((self, seconds))
+        go_on(self, seconds)
+
+    monkeypatch.setattr(runs, "TURN", 0.2)
+    monkeypatch.setattr(runs._Competitor, "go_on", spy)
+    settings = SamplerSettings(batch_size=128, lanes=32, workers=1)
+    names = list(at.scene.task.sequences)[1:3]
+    both = [runs.Run("turns", "pick_place", 0, name, 0, seconds) for name, seconds in zip(names, (1.0, 0.4), strict=True)]
+    kept = runs.execute_in_turns(at, [make_chooser(at, run.method, 0) for run in both], both, settings)
+    (first, alone), (second, turn), (third, _) = order[:3]
+    assert alone == pytest.approx(0.6) and turn == 0.2 and first is second and third is not first
+    for one, run in zip(kept, both, strict=True):
+        assert run.seconds <= one.data["meta"]["elapsed"] < run.seconds + 0.5
 
 
 def test_folder_of_another_budget_is_refused(finished):

@@ -46,8 +46,9 @@ def text(numbers: Mapping[str, Any], confronted: Sequence[claims.Claim], command
         f"Made by `{command}` on {_machine()}. Rates are samples per second of sampling time with all programs "
         "compiled and read; what that takes is listed apart. *Final rate*: over the last half of a run. Every sample counted "
         "passed the audit in double precision. Brackets are 95 % bootstrap intervals over seeds. The machine's speed "
-        "changes: where tree is measured against single sequences they ran *side by side*, a second each in turn, and "
-        "other methods are compared over the seeds that both have, whose runs were made one after the other. "
+        "changes: where tree is measured against single sequences they ran *side by side*, a second each in turn, once tree "
+        "has settled, and final rates are those of the last half of that time; other methods are compared over the seeds that "
+        "both have, whose runs were made one after the other. "
         "The paper's numbers were measured on an Intel i5-4200U at 1.6 GHz; ratios between machines say little.",
         "## Claims",
         _claims(confronted),
@@ -212,8 +213,8 @@ def _experts(scene: Mapping[str, Any]) -> str:
     head = ["Instance", "best expert", "tree over it", "tree's device time in its best sequence's operators"]
     budget = scene["budget"]
     note = (
-        f"Side by side with the best expert of the runs above, {budget['turns_seconds']:g} s each, "
-        f"{budget['turns_seeds']} seeds:\n\n"
+        f"Side by side with the best expert of the runs above, {budget['turns_seconds']:g} s each, after "
+        f"{budget['settling_seconds']:g} s in which tree settled alone; {budget['turns_seeds']} seeds:\n\n"
     )
     return note + table(head, rows)
 
@@ -344,8 +345,8 @@ def _oracle(scene: Mapping[str, Any]) -> str:
         "Rates of all complete sequences are predicted from the operators' statistics (tree and survey); of sequences "
         "that differ only in the order of independent operators one is kept. The best predicted ones are screened shortly, "
         "and so are the sequences that the paper found; the best of all these (*best found*) and the best expert are run "
-        "side by side with the tree, with the same pools and retries: the last column is its regret. *Trust*: measured over "
-        "predicted rate of the screened ones, median."
+        "side by side with the tree once it has settled, with the same pools and retries: the last column is its regret. "
+        "*Trust*: measured over predicted rate of the screened ones, median."
     )
     return table(head, rows) + "\n\n" + note
 

@@ -109,7 +109,8 @@ def execute(
 def execute_in_turns(
     problem: Problem, choosers: Sequence[Any], runs: Sequence[Run], settings: SamplerSettings | None = None
 ) -> list[Kept]:
-    """Runs choosers side by side: each goes on for `TURN` seconds of its own time, then it waits for the others.
+    """Runs choosers side by side: each goes on for `TURN` seconds of its own time, then it waits for the others. A run that is
+    longer than others begins sooner, alone, so that all end together.
 
     Runs one after the other meet a machine whose speed differs by a fifth from one minute to the next; these meet the same one.
     The batches that are on their way when a turn ends are finished in the next one's: every method gives and takes that alike.
@@ -117,6 +118,10 @@ def execute_in_turns(
     all_ = [_Competitor(problem, c, run, settings or SamplerSettings()) for c, run in zip(choosers, runs, strict=True)]
     for one in all_:
         one.begin()
+    shortest = min(run.seconds for run in runs)
+    for one, run in zip(all_, runs, strict=True):
+        if run.seconds > shortest:
+            one.go_on(run.seconds - shortest)
     while unfinished := [one for one in all_ if not one.finished]:
         for one in unfinished:
             one.go_on(TURN)
