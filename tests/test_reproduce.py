@@ -273,6 +273,18 @@ def test_a_longer_run_begins_alone_and_ends_with_those_beside_it(monkeypatch):
         assert run.seconds <= one.data["meta"]["elapsed"] < run.seconds + 0.5
 
 
+def test_final_rate_beside_others_is_of_the_time_that_they_share(tmp_path):
+    """Tree has 2 s alone and 1 s beside the others: what it made in the last half of that second counts."""
+    study_ = Study(tmp_path, ["handover"], BUDGET, PAPER)
+    made = {"tree": [0.5, 1.6, 1.9, 2.4, 2.6, 2.9], "best expert": [0.4, 0.6, 0.7, 0.9]}
+    rates = {}
+    for run in study_.turns_runs("handover"):
+        if (run.instance, run.seed) == (0, 0) and run.method in made:
+            study_.store.write(run, runs.Kept({}, np.array(made[run.method]), {}))
+            rates[run.method] = study_._final_rate(run)
+    assert rates == {"tree": pytest.approx(2 / 0.5), "best expert": pytest.approx(3 / 0.5)}
+
+
 def test_folder_of_another_budget_is_refused(finished):
     whole, _, _ = finished
     other = Study(whole.folder, ["handover"], Budget(seconds=3.0, seeds=1), PAPER)

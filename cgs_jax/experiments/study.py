@@ -399,7 +399,7 @@ class Study:
         return self.budget.settling_seconds if (stage, method) == ("turns", "tree") else 0.0
 
     def _final_rate(self, run: Run) -> float:
-        """Of what ran side by side, over the same time of the machine."""
+        """Over the last half of a run; of one that began ahead of those beside it, of the time that they share."""
         ahead = self._ahead(run.stage, run.method)
         return measures.final_rate(self.store.read(run).elapsed - ahead, run.seconds - ahead)
 
