@@ -112,7 +112,7 @@ class BatchRunner:
             problem.scene.model, attachments(task), placements(task), goals(task), switches, tolerances, own_checks(problem)
         )
         self._keyframes = Keyframes(self.problem)
-        self._seed = seed
+        self.seed = seed
         self._numbers: dict[Any, Any] = {}
         self._blanks: dict[int, np.ndarray] = {}
         self._requested: dict[int, list[Future]] = {}
@@ -230,7 +230,7 @@ class BatchRunner:
 
     def _key_of(self, operator: Operator) -> np.ndarray:
         """Key data of an operator's random stream."""
-        return np.array([self._seed % 2**32, operator.identity], np.uint32)
+        return np.array([self.seed % 2**32, operator.identity], np.uint32)
 
     # -------------------------------------------------------------- running
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import itertools
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -67,6 +68,17 @@ class Exact(NamedTuple):
     chains: dict[str, Chain]
 
 
+class Source(NamedTuple):
+    """Path of a task file, instance, and how many problems this process had loaded before: the file may change meanwhile."""
+
+    scene: str
+    instance: int
+    number: int
+
+
+_loaded = itertools.count()
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A constraint graph over a scene, and what its constraints compute."""
@@ -89,8 +101,8 @@ class Problem:
     """By seed table of a robot: the configurations that tables are made of."""
     collisions: Collisions = "after"
     """Whether clearances are checked after the solver, or kept inside it."""
-    source: tuple[str, int] | None = None
-    """Path of the task file and instance, if `load_problem` makes the same problem of them."""
+    source: Source | None = None
+    """Where it was loaded from, if `load_problem` makes the same problem of that."""
     samplers: tuple[OwnSampler, ...] = ()
     """A user's direct samplers (`cgs_jax.with_sampler`)."""
     operators: dict = field(default_factory=dict, repr=False)
@@ -125,7 +137,7 @@ def load_problem(name_or_path: str | Path, instance: int = 0) -> Problem:
     Raises InputError (one line) for anything wrong with the scene; see `cgs_jax.scene.load_scene`.
     """
     scene = load_scene(name_or_path, instance)
-    return dataclasses.replace(build_problem(scene), source=(str(scene.task.path), instance))
+    return dataclasses.replace(build_problem(scene), source=Source(str(scene.task.path), instance, next(_loaded)))
 
 
 def build_problem(scene: Scene) -> Problem:

@@ -673,8 +673,7 @@ class Sampler:
         source, workers = self.problem.source, self.settings.workers
         if source is None or workers == 1:
             return _Crew(self._runner, workers, None)
-        scene, instance = source
-        setup = Setup(scene, instance, self._seed, self._batch_settings, self._tolerances, cache_folder())
+        setup = Setup(source, self._seed, self._batch_settings, self._tolerances, cache_folder())
         return _Crew(self._runner, workers, setup)
 
     def _initial_requests(self) -> list[Operator]:

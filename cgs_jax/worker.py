@@ -9,23 +9,24 @@ loads the scene by name, so only problems that `load_problem` made can be sent (
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import pickle
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from cgs_jax import cache
 from cgs_jax.audit import Tolerances
 from cgs_jax.batches import AimedTables, Audited, Batch, BatchRunner, BatchSettings, Outcome, Values
 from cgs_jax.errors import InputError
 from cgs_jax.operators import operator_of
-from cgs_jax.problems import load_problem
+from cgs_jax.problems import Source, load_problem
 from cgs_jax.programs import Program, load_portable
 from cgs_jax.transitions import Transition
 
@@ -33,17 +34,27 @@ ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of a process whose programs run on one thread."""
 
 
+RUNNERS = 16
+"""Problems that a worker keeps with all that it was given for them: a run on one of those begins at once."""
+
+Kept = TypeVar("Kept")
+
+
 @dataclass(frozen=True)
 class Setup:
     """What the worker needs to make its runner: the second message, after the digest of the sources, and before another run."""
 
-    scene: str
-    instance: int
+    source: Source
     seed: int
     settings: BatchSettings
     tolerances: Tolerances | None
     cache_folder: Path | None
     """Where it keeps the seed tables that it makes (`cache`)."""
+
+    @property
+    def whatever_seed(self) -> Setup:
+        """That of all runs that the same runner can make."""
+        return replace(self, seed=0)
 
 
 @dataclass(frozen=True)
@@ -90,7 +101,8 @@ class Worker:
         self._asked = self._answered = 0
         self._send(cache.SOURCES)
         self._failed = False
-        self._installed: set[int] = set()
+        self._installed: set[int] = set()  # operators of the present runner
+        self._installed_in: dict[Setup, set[int]] = {}
         self._sent: set[int] = set()
 
     @property
@@ -99,8 +111,9 @@ class Worker:
         return not self._failed and self._process.poll() is None
 
     def begin(self, setup: Setup) -> None:
-        """Starts on a problem; `await_ready` tells when it can take batches. Programs that were sent before stay."""
-        self._installed.clear()
+        """Starts on a problem; `await_ready` tells when it can take batches. Programs that were sent before stay, and the last
+        problems with what they were given."""
+        self._installed = _lately(self._installed_in, setup.whatever_seed, set)
         self._send(setup)
 
     def install(self, identity: int, programs: Sequence[Program], aimed: AimedTables) -> None:
@@ -245,6 +258,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         )
         return
     loaded: dict[int, Program | None] = {}
+    runners: dict[Setup, BatchRunner] = {}
     while True:
         try:
             message: Setup | Aim | Audit | Install | Batch = pickle.load(source)
@@ -254,8 +268,8 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             if isinstance(message, Setup):
                 if message.cache_folder is not None:
                     cache.enable_disk_cache(message.cache_folder)
-                problem = load_problem(message.scene, message.instance)
-                runner = BatchRunner(problem, message.seed, message.settings, message.tolerances)
+                runner = _lately(runners, message.whatever_seed, functools.partial(_runner_of, message))
+                runner.seed = message.seed
                 answer("ready")
             elif isinstance(message, Install):
                 loaded |= {number: _loaded(data) for number, data in message.programs.items()}
@@ -271,6 +285,19 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
                 answer(runner.run(message))
         except Exception as error:  # noqa: BLE001 - sent to the process that asked
             answer(error)
+
+
+def _runner_of(setup: Setup) -> BatchRunner:
+    problem = load_problem(setup.source.scene, setup.source.instance)
+    return BatchRunner(problem, setup.seed, setup.settings, setup.tolerances)
+
+
+def _lately(kept: dict[Setup, Kept], setup: Setup, make: Callable[[], Kept]) -> Kept:
+    """What is kept for a setup, or made now; of the `RUNNERS` that were asked for last. Both ends of the pipe do so alike."""
+    kept[setup] = kept.pop(setup) if setup in kept else make()
+    while len(kept) > RUNNERS:
+        del kept[next(iter(kept))]
+    return kept[setup]
 
 
 def _loaded(data: bytes) -> Program | None:

@@ -155,7 +155,7 @@ def test_a_refusal_ends_the_run(monkeypatch):
 
 def test_a_worker_compiles_what_it_cannot_load():
     at, batch = grasps()
-    setup = worker.Setup(*at.source, 0, SMALL, None, None)
+    setup = worker.Setup(at.source, 0, SMALL, None, None)
     number = operator_of(at, batch.transition).identity
     answers = told(cache.SOURCES, setup, worker.Install(number, (1,), {1: b"no program"}, []), batch)
     assert answers[0] == "ready" and len(answers) == 2 and answers[1].success.all()
@@ -163,10 +163,40 @@ def test_a_worker_compiles_what_it_cannot_load():
 
 def test_a_worker_serves_one_run_after_another():
     at, batch = grasps()
-    first, second = (worker.Setup(at.source[0], instance, 0, SMALL, None, None) for instance in (at.source[1], 3))
+    first, second = (worker.Setup(source, 0, SMALL, None, None) for source in (at.source, at.source._replace(instance=3)))
     answers = told(cache.SOURCES, first, batch, second, batch)
     assert answers[0] == answers[2] == "ready" and len(answers) == 4
     assert answers[1].success.all() and answers[3].success.all()
+
+
+@pytest.mark.parametrize(("kept", "loaded"), [(2, [0, 3, 0]), (1, [0, 3, 0, 0])])
+def test_a_worker_keeps_the_problems_that_it_ran_last(monkeypatch, kept, loaded):
+    at, batch = grasps()
+    seen = []
+    monkeypatch.setattr(worker, "RUNNERS", kept)
+    monkeypatch.setattr(worker, "load_problem", lambda scene, i: seen.append(i) or cgs_jax.load_problem(scene, i))
+    other, again = at.source._replace(instance=3), at.source._replace(number=at.source.number + 1)
+    setups = [worker.Setup(*pair, SMALL, None, None) for pair in ((at.source, 0), (other, 0), (at.source, 1), (again, 0))]
+    answers = told(cache.SOURCES, *(message for setup in setups for message in (setup, batch)))
+    assert seen == loaded
+    first, _, second, third = (answer.values["t"] for answer in answers[1::2])
+    # Another seed is drawn from on what is kept; a file that was loaded again is read again.
+    assert not np.array_equal(first, second) and np.array_equal(first, third)
+
+
+@pytest.mark.parametrize(("kept", "times"), [(2, 1), (1, 2)])
+def test_what_a_worker_has_forgotten_is_sent_again(monkeypatch, kept, times):
+    sent = []
+    monkeypatch.setattr(worker, "RUNNERS", kept)
+    monkeypatch.setattr(worker.Worker, "_send", lambda self, message: sent.append(message))
+    at, _ = grasps()
+    one = worker.Worker()
+    for source, seed in ((at.source, 0), (at.source, 1), (at.source._replace(instance=3), 0), (at.source, 2)):
+        one.begin(worker.Setup(source, seed, SMALL, None, None))
+        if source == at.source:
+            one.install(7, [], [])
+    one.close()
+    assert sum(isinstance(message, worker.Install) for message in sent) == times
 
 
 def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
@@ -185,7 +215,7 @@ def test_the_next_run_takes_the_workers_of_the_last(monkeypatch):
 def test_a_worker_that_several_threads_ask_gives_each_its_answer(monkeypatch):
     monkeypatch.setattr(worker, "_idle", [])
     at, batch = grasps()
-    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None, None))
+    one = worker.hire(worker.Setup(at.source, 0, SMALL, None, None))
     assert one.await_ready()
     with ThreadPoolExecutor(4) as threads:
         questions = [dataclasses.replace(batch, tasks=count) for count in range(1, SMALL.batch_size + 1)]
@@ -197,7 +227,7 @@ def test_a_worker_that_several_threads_ask_gives_each_its_answer(monkeypatch):
 def test_a_worker_that_failed_is_not_kept(monkeypatch):
     monkeypatch.setattr(worker, "_idle", [])
     at, batch = grasps()
-    one = worker.hire(worker.Setup(*at.source, 0, SMALL, None, None))
+    one = worker.hire(worker.Setup(at.source, 0, SMALL, None, None))
     assert one.await_ready()
     with pytest.raises(Exception, match="object"):
         one.run("no batch")
