@@ -144,6 +144,11 @@ class BatchRunner:
         """Gives an operator seed tables that were made elsewhere."""
         self._aimed[identity] = aimed
 
+    def put_aside(self) -> None:
+        """Forgets what is made again in no time, until the next run."""
+        self._numbers.clear()
+        self._blanks.clear()
+
     def install(self, identity: int, ready: list[programs.Program]) -> None:
         """Gives an operator programs that were compiled elsewhere."""
         futures: list[Future] = []

@@ -34,8 +34,9 @@ ONE_THREAD = {"NPROC": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of a process whose programs run on one thread."""
 
 
-RUNNERS = 16
-"""Problems that a worker keeps with all that it was given for them: a run on one of those begins at once."""
+KEPT_PROBLEMS = 32
+"""Problems that all workers together keep with the seed tables that they were given for them, up to 80 MB each: a run on one of
+those begins at once."""
 
 Kept = TypeVar("Kept")
 
@@ -50,11 +51,13 @@ class Setup:
     tolerances: Tolerances | None
     cache_folder: Path | None
     """Where it keeps the seed tables that it makes (`cache`)."""
+    kept: int = 1
+    """Problems that it keeps, this one among them."""
 
     @property
-    def whatever_seed(self) -> Setup:
-        """That of all runs that the same runner can make."""
-        return replace(self, seed=0)
+    def of_runner(self) -> Setup:
+        """The same for all runs that one runner can make."""
+        return replace(self, seed=0, kept=1)
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Worker:
     def begin(self, setup: Setup) -> None:
         """Starts on a problem; `await_ready` tells when it can take batches. Programs that were sent before stay, and the last
         problems with what they were given."""
-        self._installed = _lately(self._installed_in, setup.whatever_seed, set)
+        self._installed = _lately(self._installed_in, setup, set)
         self._send(setup)
 
     def install(self, identity: int, programs: Sequence[Program], aimed: AimedTables) -> None:
@@ -216,6 +219,7 @@ def keep(count: int) -> None:
 
 def hire(setup: Setup) -> Worker:
     """A worker for a run: one that an earlier run of this process left, or a new one."""
+    setup = replace(setup, kept=max(KEPT_PROBLEMS // max(_most_idle, 1), 1))
     while _idle:
         worker = _idle.pop()
         if worker.usable:
@@ -259,6 +263,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
         return
     loaded: dict[int, Program | None] = {}
     runners: dict[Setup, BatchRunner] = {}
+    runner: Any = None  # until the first setup
     while True:
         try:
             message: Setup | Aim | Audit | Install | Batch = pickle.load(source)
@@ -268,7 +273,9 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             if isinstance(message, Setup):
                 if message.cache_folder is not None:
                     cache.enable_disk_cache(message.cache_folder)
-                runner = _lately(runners, message.whatever_seed, functools.partial(_runner_of, message))
+                if runner is not None:
+                    runner.put_aside()
+                runner = _lately(runners, message, functools.partial(_runner_of, message))
                 runner.seed = message.seed
                 answer("ready")
             elif isinstance(message, Install):
@@ -293,11 +300,12 @@ def _runner_of(setup: Setup) -> BatchRunner:
 
 
 def _lately(kept: dict[Setup, Kept], setup: Setup, make: Callable[[], Kept]) -> Kept:
-    """What is kept for a setup, or made now; of the `RUNNERS` that were asked for last. Both ends of the pipe do so alike."""
-    kept[setup] = kept.pop(setup) if setup in kept else make()
-    while len(kept) > RUNNERS:
+    """What is kept for a setup, or made now; only the last ones are kept. Both ends of the pipe do so alike."""
+    key = setup.of_runner
+    kept[key] = kept.pop(key) if key in kept else make()
+    while len(kept) > setup.kept:
         del kept[next(iter(kept))]
-    return kept[setup]
+    return kept[key]
 
 
 def _loaded(data: bytes) -> Program | None:

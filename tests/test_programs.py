@@ -173,10 +173,10 @@ def test_a_worker_serves_one_run_after_another():
 def test_a_worker_keeps_the_problems_that_it_ran_last(monkeypatch, kept, loaded):
     at, batch = grasps()
     seen = []
-    monkeypatch.setattr(worker, "RUNNERS", kept)
     monkeypatch.setattr(worker, "load_problem", lambda scene, i: seen.append(i) or cgs_jax.load_problem(scene, i))
     other, again = at.source._replace(instance=3), at.source._replace(number=at.source.number + 1)
-    setups = [worker.Setup(*pair, SMALL, None, None) for pair in ((at.source, 0), (other, 0), (at.source, 1), (again, 0))]
+    pairs = (at.source, 0), (other, 0), (at.source, 1), (again, 0)
+    setups = [worker.Setup(*pair, SMALL, None, None, kept) for pair in pairs]
     answers = told(cache.SOURCES, *(message for setup in setups for message in (setup, batch)))
     assert seen == loaded
     first, _, second, third = (answer.values["t"] for answer in answers[1::2])
@@ -187,12 +187,11 @@ def test_a_worker_keeps_the_problems_that_it_ran_last(monkeypatch, kept, loaded)
 @pytest.mark.parametrize(("kept", "times"), [(2, 1), (1, 2)])
 def test_what_a_worker_has_forgotten_is_sent_again(monkeypatch, kept, times):
     sent = []
-    monkeypatch.setattr(worker, "RUNNERS", kept)
     monkeypatch.setattr(worker.Worker, "_send", lambda self, message: sent.append(message))
     at, _ = grasps()
     one = worker.Worker()
     for source, seed in ((at.source, 0), (at.source, 1), (at.source._replace(instance=3), 0), (at.source, 2)):
-        one.begin(worker.Setup(source, seed, SMALL, None, None))
+        one.begin(worker.Setup(source, seed, SMALL, None, None, kept))
         if source == at.source:
             one.install(7, [], [])
     one.close()
