@@ -145,7 +145,7 @@ class BatchRunner:
         self._aimed[identity] = aimed
 
     def put_aside(self) -> None:
-        """Forgets what is made again in no time, until the next run."""
+        """Gives back the memory of what a later run makes again in a millisecond: tables on the device."""
         self._numbers.clear()
         self._blanks.clear()
 
